@@ -15,10 +15,10 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 import scipy.signal
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.multisine import Excitation, design_multisine
 from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.sensor.acquisition import BenchEffects
@@ -33,7 +33,7 @@ from tactile_resonance.simulation.tissue.library import read_tissues
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-Array = npt.NDArray[np.float64]
+Array = FloatArray
 
 PERIODS = 8
 SIGNAL_S = 3.2
@@ -223,7 +223,7 @@ def measure_accuracy(setup: Setup, settling: int) -> tuple[dict, dict, dict]:
     return linear, spectra, errors
 
 
-def _spectrum(period: Array) -> npt.NDArray[np.complex128]:
+def _spectrum(period: Array) -> ComplexArray:
     return scipy.fft.rfft(period) / period.size
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.skip_point import SimulatedPoint, pole_of
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.contact import TissueContact
 from tactile_resonance.calibration.contact_record import ContactRecord
@@ -29,8 +29,6 @@ from tactile_resonance.simulation.sensor.known_loads import (
 )
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import TissueLibrary, read_tissues
-
-FloatArray = npt.NDArray[np.float64]
 
 MASS_KG, MASS_RELATIVE_STD = 5e-5, 1e-3
 SKEW_STD_S = 2e-6

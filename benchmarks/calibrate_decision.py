@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.calibrate_benches import (
     AGES_S,
@@ -25,6 +24,7 @@ from benchmarks.calibrate_benches import (
 )
 from benchmarks.skip_decision import PERCENT, PREPARATION_PERCENT, squared
 from benchmarks.skip_point import SimulatedPoint, pole_of
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.scan.decision import BlockLimits, Separate, Verdict, decide_tissue
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import (
@@ -33,8 +33,6 @@ from tactile_resonance.tissue.nominal_contact import (
     NominalContact,
     refer_to_nominal,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 PROBABILITY = 0.99
 MOST_S = 0.2

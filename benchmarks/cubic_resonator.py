@@ -8,9 +8,8 @@ fourth order; between samples the input is that of the multisine, exactly.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from tactile_resonance._typing import FloatArray
 
 SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD = 4000.0, 1600
 HARMONICS = np.arange(4, 401)  # 10 to 1000 Hz

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.frf.estimate import fast_frf, robust_frf
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.measurement import MeasurementFrf
@@ -28,7 +28,7 @@ from tactile_resonance.record import Channel, Record
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-Array = npt.NDArray[np.float64]
+Array = FloatArray
 
 RATE_HZ, SAMPLES, PERIODS = 50e3, 20000, 8
 BAND_HZ = (200.0, 300.0)

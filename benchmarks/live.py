@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.processor import fft_s, loop_s
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.processes import free_domain_id, may_take_priority
 from tactile_resonance.simulation.plant.defaults import PRIORITY
@@ -29,7 +29,6 @@ from tactile_resonance.simulation.plant.defaults import PRIORITY
 if TYPE_CHECKING:
     from benchmarks.live_bench import LiveScan, Shares
 
-FloatArray = NDArray[np.float64]
 
 GOAL_LOOP_S = 0.48
 """Goals are those of a machine on which the loop takes so long."""

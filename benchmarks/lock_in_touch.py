@@ -8,12 +8,11 @@ observation (Anderson, *An Introduction to Multivariate Statistical Analysis*, 2
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import special
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
-
-FloatArray = NDArray[np.float64]
 
 LEAST_REFERENCE = 20
 """Observations in air from which their scatter is known well enough."""

@@ -15,20 +15,18 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks import frf, poles_methods, skip_decision, stability
 from benchmarks.poles_methods import BARE, Method, estimates_of, joint_plan
 from benchmarks.poles_plant import Plant, judge
 from benchmarks.stability_cells import cells
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.commands.benchmark import NAMES
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.report.drawing import new_figure, save_figure
-
-FloatArray = npt.NDArray[np.float64]
 
 KEPT = Path("docs/benchmarks/overview.json")
 WORSE = {"time": 1.5, "error": 1.15, "count": 1.0}

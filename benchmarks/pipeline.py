@@ -17,11 +17,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.processes import NodeProcesses, free_domain_id
-
-FloatArray = NDArray[np.float64]
 
 NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
 PERIODS = 8
@@ -67,7 +65,7 @@ class Latencies:
     stages_s: FloatArray
     transports_s: FloatArray
     computing_ms: Mapping[str, FloatArray]
-    periods: NDArray[np.int64]
+    periods: IntArray
     record_bytes: int
 
     @property

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 from tactile_resonance.action import Measure
 
 from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, PERIOD_S
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.recording.messages import record_from_message
@@ -55,7 +55,7 @@ class PipelineListener(ScanSession):
             self.spin(0.05)
         self._busy.clear()
 
-    def busy_ms(self, node: str, topic: str) -> NDArray[np.float64]:
+    def busy_ms(self, node: str, topic: str) -> FloatArray:
         """How long messages of a topic kept a node.
 
         Returns
@@ -86,7 +86,7 @@ class PipelineListener(ScanSession):
         result = self.measure(position_m, request, lambda done, planned: None)
         return result.origin.measurement_id
 
-    def times_ns(self, keys: Sequence[int]) -> tuple[NDArray[np.int64], int]:
+    def times_ns(self, keys: Sequence[int]) -> tuple[IntArray, int]:
         """Times of every block of these measurements, and the size of a record.
 
         Returns

@@ -28,6 +28,7 @@ from benchmarks.poles_methods import (
 from benchmarks.poles_plant import BAND_HZ, Plant, judge
 from benchmarks.poles_realisations import grid_table
 from benchmarks.poles_reidentify import reidentify_table
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.poles.identify import identify_spectra
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
@@ -109,14 +110,14 @@ class Cell:
     """
 
     plant: Plant
-    ratio: npt.NDArray[np.float64]
+    ratio: FloatArray
     coverage: float
     failed: int
     alarms: int
-    elis_ratio: npt.NDArray[np.float64]
+    elis_ratio: FloatArray
     elis_coverage: float
-    bound: npt.NDArray[np.float64]
-    settled_bound: npt.NDArray[np.float64]
+    bound: FloatArray
+    settled_bound: FloatArray
 
 
 def measure_cell(plant: Plant, runs: int) -> Cell:

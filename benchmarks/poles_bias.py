@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.structure import ModelStructure
@@ -23,7 +23,7 @@ PERIODS = 8
 
 def tissue_bias(
     structures: Sequence[ModelStructure], tissues: Sequence[str] = TISSUES
-) -> dict[str, list[npt.NDArray[np.float64]]]:
+) -> dict[str, list[FloatArray]]:
     """Error of noise-free fits over the noise standard deviation of noisy ones.
 
     Returns
@@ -45,7 +45,7 @@ def tissue_bias(
         JointPlan(SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, PERIODS, HARMONICS, BAND_HZ, structure)
         for structure in structures
     ]
-    result: dict[str, list[npt.NDArray[np.float64]]] = {}
+    result: dict[str, list[FloatArray]] = {}
     for name in tissues:
         records = []
         for effects in (BenchEffects.none(), BenchEffects()):

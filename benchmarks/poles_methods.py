@@ -20,6 +20,7 @@ from benchmarks.poles_plant import (
     SAMPLES_PER_PERIOD,
     Plant,
 )
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import ratio_variance
@@ -39,7 +40,7 @@ class Method:
 
     name: str
     time_s: float
-    error: npt.NDArray[np.float64]
+    error: FloatArray
     note: str = ""
 
 
@@ -53,7 +54,7 @@ class Contestant:
     name: str
     call: Callable[[], Any]
     points: int
-    estimates: Callable[[Any], npt.NDArray[np.float64]] | None = None
+    estimates: Callable[[Any], FloatArray] | None = None
 
 
 def joint_plan(
@@ -179,9 +180,7 @@ def compare_methods(quick: bool) -> list[Method]:
     return _measured(contestants, np.sqrt(np.diag(plant.bound()))) + missing
 
 
-def _measured(
-    contestants: list[Contestant], bound: npt.NDArray[np.float64], rounds: int = 15
-) -> list[Method]:
+def _measured(contestants: list[Contestant], bound: FloatArray, rounds: int = 15) -> list[Method]:
     """Least processor time of several rounds in which all take turns, after a first call.
 
     In turns, so that a machine that is busy for a while slows all of them.
@@ -207,7 +206,7 @@ def _measured(
     return methods
 
 
-def _mean_square(errors: npt.NDArray) -> npt.NDArray[np.float64]:
+def _mean_square(errors: npt.NDArray) -> FloatArray:
     """(2,) over the rows that are finite; NaN where there is none."""
     good = errors[np.isfinite(errors).all(axis=-1)]
     return np.mean(good**2, axis=0) if good.size else np.full(2, np.nan)
@@ -217,7 +216,7 @@ def _missing(name: str, error: ImportError) -> Method:
     return Method(name, np.nan, np.full(2, np.nan), f"not measured: {error}")
 
 
-def estimates_of(result: PolesBatch) -> npt.NDArray[np.float64]:
+def estimates_of(result: PolesBatch) -> FloatArray:
     """(runs, 2) f0 and damping ratio."""
     return np.stack([result.f0_hz[:, 0], result.damping_ratio[:, 0]], -1)
 

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from benchmarks.poles_plant import Plant
+from tactile_resonance._typing import ComplexArray, FloatArray
 
 Estimator = Callable[[int], tuple[float, float]]
 NOTHING = (float("nan"), float("nan"))
@@ -45,15 +46,15 @@ class Case:
     """
 
     plant: Plant
-    frequency_hz: npt.NDArray[np.float64]
-    g: npt.NDArray[np.complex128]
-    variance: npt.NDArray[np.float64]
+    frequency_hz: FloatArray
+    g: ComplexArray
+    variance: FloatArray
     joint: tuple[npt.NDArray, npt.NDArray, npt.NDArray]
-    wide_hz: npt.NDArray[np.float64]
-    wide_g: npt.NDArray[np.complex128]
+    wide_hz: FloatArray
+    wide_g: ComplexArray
 
 
-def _nearest(poles_rad_s: npt.NDArray[np.complex128]) -> tuple[float, float]:
+def _nearest(poles_rad_s: ComplexArray) -> tuple[float, float]:
     """Of poles above the real axis the one nearest to 250 Hz."""
     above = poles_rad_s[poles_rad_s.imag > 0]
     if above.size == 0:

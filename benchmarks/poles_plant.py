@@ -15,6 +15,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray
+
 SAMPLE_RATE_HZ = 50e3
 SAMPLES_PER_PERIOD = 20000
 HARMONICS = np.arange(4, 4001)
@@ -43,14 +45,14 @@ class Plant:
     seed: int = 1
 
     @cached_property
-    def phasor(self) -> npt.NDArray[np.complex128]:
+    def phasor(self) -> ComplexArray:
         """(lines,) excitation of 1 V rms; u = sum 2 Re phasor exp(j w t)."""
         rng = np.random.default_rng(self.seed)
         turns = rng.uniform(0, 2 * np.pi, HARMONICS.size)
         return np.exp(1j * turns) / np.sqrt(2 * HARMONICS.size)
 
     @property
-    def theta(self) -> npt.NDArray[np.float64]:
+    def theta(self) -> FloatArray:
         """[f0, damping, b0 / w0^2, b1 / w0, b2, Re c, Im c]: c the free decay from rest."""
         zeta = self.damping_ratio
         system = np.array([F0_HZ, zeta, 0.1 + 2 * zeta, 0.2 * zeta, 0.1])
@@ -74,16 +76,14 @@ class Plant:
         resolution = SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD / self.periods
         return np.arange(round(low_hz / resolution), round(high_hz / resolution) + 1)
 
-    def input(self, bins: npt.NDArray) -> npt.NDArray[np.complex128]:
+    def input(self, bins: npt.NDArray) -> ComplexArray:
         """(K,) exact U on bins."""
         u = np.zeros(bins.size, complex)
         excited = bins % self.periods == 0
         u[excited] = self.phasor[bins[excited] // self.periods - HARMONICS[0]]
         return u
 
-    def output(
-        self, bins: npt.NDArray, theta: npt.NDArray | None = None
-    ) -> npt.NDArray[np.complex128]:
+    def output(self, bins: npt.NDArray, theta: npt.NDArray | None = None) -> ComplexArray:
         """(K,) exact Y on bins, transient included."""
         theta = self.theta if theta is None else theta
         samples = SAMPLES_PER_PERIOD * self.periods
@@ -101,13 +101,13 @@ class Plant:
         """U and Y (runs, K) with independent circular noise."""
         variance_y, variance_u = self.noise
 
-        def noise(variance: float) -> npt.NDArray[np.complex128]:
+        def noise(variance: float) -> ComplexArray:
             parts = rng.standard_normal((runs, bins.size, 2)) * np.sqrt(variance / 2)
             return parts.view(complex)[..., 0]
 
         return self.input(bins) + noise(variance_u), self.output(bins) + noise(variance_y)
 
-    def bound(self, transient: bool = True) -> npt.NDArray[np.float64]:
+    def bound(self, transient: bool = True) -> FloatArray:
         """(2, 2) Cramer-Rao bound of (f0, damping) from the bins of the band.
 
         With `transient` the initial state is unknown and all bins are used; without, the record is
@@ -119,7 +119,7 @@ class Plant:
             jacobian = jacobian[:, :5] * (self.bins() % self.periods == 0)[:, None]
         return _inverse_information(jacobian, variance)
 
-    def derivatives(self) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.float64]]:
+    def derivatives(self) -> tuple[ComplexArray, FloatArray]:
         """(K, 7) derivative of Y by theta on the bins of the band, and (K,) variance of ``Y - G U``."""
         bins, theta = self.bins(), self.theta
         columns = []
@@ -136,7 +136,7 @@ class Plant:
         return np.stack(columns, axis=-1), variance_y + gain * variance_u
 
 
-def bound_of_realisations(plants: list[Plant], distortion: float = 0.0) -> npt.NDArray[np.float64]:
+def bound_of_realisations(plants: list[Plant], distortion: float = 0.0) -> FloatArray:
     """(2, 2) Cramer-Rao bound of (f0, damping) from records of one plant, other phases in each.
 
     Every initial state is unknown. Unknown levels change nothing, see `Plant.bound`.
@@ -159,9 +159,7 @@ def bound_of_realisations(plants: list[Plant], distortion: float = 0.0) -> npt.N
     return _inverse_information(np.concatenate(rows), np.concatenate(variances))
 
 
-def _inverse_information(
-    jacobian: npt.NDArray[np.complex128], variance: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def _inverse_information(jacobian: ComplexArray, variance: FloatArray) -> FloatArray:
     """(2, 2) block of the first two parameters."""
     scale = np.sqrt(np.sum(np.abs(jacobian) ** 2 / variance[:, None], axis=0))
     scaled = jacobian / np.sqrt(variance)[:, None] / scale
@@ -177,7 +175,7 @@ def pole_and_residue(system: npt.NDArray) -> tuple[complex, complex]:
     return pole, (b2 * pole**2 + b1 * w0 * pole + b0 * w0**2) / (pole - np.conj(pole))
 
 
-def response(theta: npt.NDArray, s: npt.NDArray) -> npt.NDArray[np.complex128]:
+def response(theta: npt.NDArray, s: npt.NDArray) -> ComplexArray:
     """(F,) G at s."""
     f0, zeta, b0, b1, b2 = theta[:5]
     w0 = 2 * np.pi * f0

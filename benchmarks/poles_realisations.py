@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
 from benchmarks.poles_plant import (
@@ -20,6 +19,7 @@ from benchmarks.poles_plant import (
     bound_of_realisations,
     judge,
 )
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.poles.joint import PoleEstimator
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
@@ -53,7 +53,7 @@ class Cell:
     realisations: int
     plant: Plant
     distortion_db: float | None
-    ratio: npt.NDArray[np.float64]
+    ratio: FloatArray
     coverage: float
     coverage_noise: float
     failed: int

@@ -17,6 +17,7 @@ from scipy import stats
 
 from benchmarks.skip_decision import AGES_S, FORCE_STD_N, PREPARATION_PERCENT
 from benchmarks.skip_point import SimulatedPoint
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.files import write_whole
 from tactile_resonance.frf.measurement import MeasurementFrf
@@ -38,7 +39,6 @@ from tactile_resonance.tissue.spread import ReferencePoints, spreads_of, within_
 from tactile_resonance.tissue.step import smallest_steps
 from tactile_resonance.tissue.trial import Trial, call_points, reliability
 
-FloatArray = npt.NDArray[np.float64]
 SCENE, NOMINAL = "config/scenes/two_gelatines.yaml", "config/scenes/inclusion_scan.yaml"
 PERCENT = (10.0, 12.0, 14.0, 16.0)
 CLOSE = (10.0, 11.0, 12.0)
@@ -228,7 +228,7 @@ def called(trial: Trial, level: float) -> npt.NDArray[np.str_]:
     return np.where(trial.tail < level, UNKNOWN, trial.likely)
 
 
-def share(which: npt.NDArray[np.bool_]) -> str:
+def share(which: BoolArray) -> str:
     """Part in per cent, with its 95 % limits (Clopper and Pearson); points are independent."""
     result = stats.binomtest(int(which.sum()), len(which))
     limits = result.proportion_ci(0.95)

@@ -15,17 +15,15 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.processor import cpu_s
 from benchmarks.simulated_robot import simulated_robot
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import ArmError
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.simulation.plant.simulated_robot import order
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
-
-FloatArray = NDArray[np.float64]
 
 HOST = "127.0.77.1"
 SPEED_M_S, ACCELERATION_M_S2 = 0.02, 2.0

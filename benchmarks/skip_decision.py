@@ -15,10 +15,10 @@ from functools import cache
 from multiprocessing import get_context
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
 from benchmarks.skip_point import SimulatedPoint, pole_of
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands
@@ -42,8 +42,6 @@ from tactile_resonance.tissue.nominal_contact import (
     NominalContact,
     refer_to_nominal,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 SCENE = "config/scenes/two_gelatines.yaml"
 PERCENT = (10.0, 12.0)

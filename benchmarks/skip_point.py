@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Record
 from tactile_resonance.simulation.sensor.acquisition import convert
@@ -15,8 +15,6 @@ from tactile_resonance.simulation.sensor.linear import Lines, sample_period
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
 from tactile_resonance.simulation.sensor.response import ResponseStream, VaryingStream
 from tactile_resonance.simulation.tissue.hertz import Tissue
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class SimulatedPoint:

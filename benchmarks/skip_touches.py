@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from tqdm import tqdm
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.adaptive import Adaptive, WantedBoundary
 from tactile_resonance.scan.kriging import KrigedSurface, krige
@@ -23,7 +24,6 @@ from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import PhantomScene, read_scene
 from tactile_resonance.simulation.tissue.shapes import Sphere
 
-FloatArray = npt.NDArray[np.float64]
 PHANTOMS, QUICK_PHANTOMS = 50, 6
 RADIUS_M = (0.006, 0.012)
 """Of the ball; as in the inclusion scene it lies 0.2 mm under the surface."""

@@ -15,14 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.stability_cells import SNR_DB, Cell, cells
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
-
-FloatArray = npt.NDArray[np.float64]
 
 RUNS, QUICK_RUNS, QUICK_ORDER = 12, 3, 12
 VARIANCE_DOF = 14

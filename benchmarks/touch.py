@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.lock_in_touch import ScatterTouch, lock_in
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.estimator import TouchDetector
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.simulation.plant.tip import SprungIndenter
@@ -24,8 +24,6 @@ from tactile_resonance.simulation.sensor.linear import Lines
 from tactile_resonance.simulation.sensor.response import ResponseStream
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import read_tissues
-
-FloatArray = NDArray[np.float64]
 
 RATE_HZ, LINE_HZ, WINDOW_S, STEP_S = 50_000.0, 250.0, 0.008, 0.002
 DRIVE_V, NOISE_V = 1.0, 5e-4

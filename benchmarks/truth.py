@@ -9,7 +9,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 from tqdm import tqdm
 
@@ -23,6 +22,7 @@ from benchmarks.cubic_resonator import (
     linear_mode,
     records,
 )
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import identify_poles_from_records
@@ -37,8 +37,6 @@ from tactile_resonance.simulation.sensor.bench import DEFAULT_EFFECTS, BenchRun,
 from tactile_resonance.simulation.sensor.changing_contact import ContactHistory, pole_trajectory
 from tactile_resonance.simulation.sensor.linear import Lines
 from tactile_resonance.simulation.tissue.library import read_tissues
-
-FloatArray = npt.NDArray[np.float64]
 
 GROUPS, QUICK_GROUPS, CHUNK = 400, 60, 400
 CUBIC = {None: 0.0, -45: 2.8e-5, -36: 8e-5, -27: 2.5e-4}
@@ -74,7 +72,7 @@ class Row:
         f0 [Hz] and damping ratio of the best linear approximation.
     """
 
-    ok: npt.NDArray[np.bool_]
+    ok: BoolArray
     deviations: FloatArray
     mse: FloatArray
     named: float

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.contact import REFERENCE, cases
 from benchmarks.contact_case import FORCE_N, KNOWN, Outcome, run_controller
@@ -19,6 +18,7 @@ from benchmarks.contact_client import ContactClient
 from benchmarks.contact_drivers import TISSUES
 from benchmarks.simulated_robot import simulated_robot
 from benchmarks.twist_stub import TwistStub, stub_parameters
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.clock import PORT
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.processes import NodeProcesses, free_domain_id
@@ -29,7 +29,7 @@ HOST = "127.0.13.78"
 STEP_M = 0.006  # between contacts: fresh tissue
 RATES_HZ = (500.0, 125.0)
 
-Truth = Callable[[float], tuple[NDArray[np.float64], NDArray[np.float64]]]
+Truth = Callable[[float], tuple[FloatArray, FloatArray]]
 """Time [s] and true force along the normal [N] of all steps after a time."""
 
 
@@ -96,7 +96,7 @@ def _twist(rate_hz: float) -> Iterator[Lab]:
         folder = Path(name)
         with _node(stub_parameters(folder, rate_hz), folder) as client:
 
-            def truth(after_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            def truth(after_s: float) -> tuple[FloatArray, FloatArray]:
                 rows = np.array(stub.controller.force_n)
                 return rows[rows[:, 0] > after_s].T
 
@@ -115,7 +115,7 @@ def _ur_rtde() -> Iterator[Lab]:
         _node(parameters, Path(name)) as client,
     ):
 
-        def truth(after_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        def truth(after_s: float) -> tuple[FloatArray, FloatArray]:
             # the plant counts from 0, the time of its bench does not
             times, forces = [after_s - 1e-9 * START_NS], [0.0]
             while (part := order(HOST, "history", after_s=times[-1]))["time_s"]:
@@ -146,7 +146,7 @@ def _contacts(lab: Lab, count: int) -> list[Held | str]:
     return done
 
 
-def _judged(time_s: NDArray[np.float64], force_n: NDArray[np.float64], ready_s: float) -> Held:
+def _judged(time_s: FloatArray, force_n: FloatArray, ready_s: float) -> Held:
     touched_s = time_s[np.argmax(force_n > 0)]
     until = force_n[time_s <= ready_s + 1.0] / FORCE_N - 1
     second = until[time_s[: len(until)] > ready_s]

@@ -8,10 +8,9 @@ inertia of the tip.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-FloatArray = NDArray[np.float64]
+from tactile_resonance._typing import FloatArray
 
 
 def frequency_equation(beta: float, mass_ratio: float) -> float:

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import number, numbers, require, whole
 from tactile_resonance.poles.structure import PoleBand
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 
 class Grid(Enum):
@@ -114,7 +112,7 @@ class Excitation:
         """Length of one period [s]."""
         return self.samples_per_period / self.sample_rate_hz
 
-    def spectrum(self) -> npt.NDArray[np.complex128]:
+    def spectrum(self) -> ComplexArray:
         """(N // 2 + 1,) one-sided spectrum [V], ``X[k] = (1/N) sum_n u[n] exp(-j 2 pi k n / N)``."""
         spectrum = np.zeros(self.samples_per_period // 2 + 1, complex)
         spectrum[self.harmonics] = 0.5 * self.amplitude_v * np.exp(1j * self.phase_rad)
@@ -176,7 +174,7 @@ def harmonics_on_grid(
 
 def mains_lines(
     frequency_hz: FloatArray, spacing_hz: float, mains_hz: Sequence[float], lines_beside: int = 1
-) -> npt.NDArray[np.bool_]:
+) -> BoolArray:
     """(F,) which lines are the nearest to a harmonic of the mains, or one of those beside it.
 
     Parameters

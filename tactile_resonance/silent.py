@@ -10,7 +10,8 @@ import numpy.typing as npt
 import scipy.fft
 from scipy import signal, special
 
-from tactile_resonance.tones import FloatArray, Tone, level_around
+from tactile_resonance._typing import BoolArray, FloatArray
+from tactile_resonance.tones import Tone, level_around
 
 MOST_SAMPLES = 2**18
 """Of a piece; longer records are cut, and the powers of the pieces averaged."""
@@ -124,7 +125,7 @@ def _pieces(x: FloatArray) -> FloatArray:
 
 
 def _peaks(
-    power: FloatArray, kind: npt.NDArray[np.bool_], level: FloatArray, records: int, around: int
+    power: FloatArray, kind: BoolArray, level: FloatArray, records: int, around: int
 ) -> list[tuple[float, float]]:
     """Place, in bins, and power of each peak that noise would not make."""
     dof = records * around * DOF_OF_A_BIN

@@ -6,11 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 from scipy.ndimage import median_filter
 
-FloatArray = npt.NDArray[np.float64]
+from tactile_resonance._typing import BoolArray, FloatArray
 
 MAINS_HZ = (50.0, 60.0)
 MAINS_TOLERANCE_HZ = 0.2
@@ -65,7 +64,7 @@ class Tone:
 
 
 def level_around(
-    power: FloatArray, kind: npt.NDArray[np.bool_], records: int, window: int
+    power: FloatArray, kind: BoolArray, records: int, window: int
 ) -> tuple[FloatArray, int]:
     """(K,) mean power of noise at each bin by the median of those of a kind around.
 

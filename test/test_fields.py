@@ -15,8 +15,8 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import (
     LONGEST,
     MOST_BYTES,
@@ -61,7 +61,7 @@ class Outer:
     several: tuple[Inner, ...] = ()
     named: Mapping[str, float] = field(default_factory=dict)
     perhaps: float | None = None
-    table: NDArray[np.float64] | None = None
+    table: FloatArray | None = None
     doubled: Annotated[float, read_doubled] = 0.0
     anything: Any = None
     from_: str = ""

@@ -9,7 +9,7 @@ from tactile_resonance import cli
 
 PACKAGE = Path(cli.__file__).parent
 TOOLS = {
-    *("clock", "configuration", "fields", "files", "processes"),
+    *("_typing", "clock", "configuration", "fields", "files", "processes"),
     *("array_files", "rows_file", "strict_yaml"),
 }
 CORE = {
@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "simulation": CORE | TOOLS,
 }
 """By part of the package; parts that are not here may import all others."""
-OF_THE_ROBOT = ("contact.vectors", "fields", "simulation.noise", "simulation.ur5e")
+OF_THE_ROBOT = ("_typing", "contact.vectors", "fields", "simulation.noise", "simulation.ur5e")
 LIBRARIES = {
     "numba": {"poles", "mechanics"},
     "rosbags": {"scan"},

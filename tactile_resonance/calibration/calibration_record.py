@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from tactile_resonance.calibration.model import ComplexArray, FloatArray
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.excited import find_excited_harmonics

@@ -9,13 +9,13 @@ from enum import Enum
 
 import numpy as np
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.calibration.law import (
     POISSON_RATIO,
     STRICT_HERTZ,
     ContactPrior,
     ContactStiffness,
 )
-from tactile_resonance.calibration.model import ComplexArray, FloatArray
 from tactile_resonance.poles.result import Poles
 
 _SMALL = 1e-6

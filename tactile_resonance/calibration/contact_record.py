@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.calibration.model import ComplexArray, FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.spectra import Spectrum
@@ -92,7 +92,7 @@ class ContactRecord:
         )
 
     @property
-    def excited(self) -> npt.NDArray[np.bool_]:
+    def excited(self) -> BoolArray:
         """(K,) bins that are lines."""
         return np.isin(
             np.rint(self.frequency_hz * self.duration_s), np.rint(self.line_hz * self.duration_s)

@@ -18,10 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.calibration.contact import ContactStatus, TissueContact, slope_of
 from tactile_resonance.calibration.contact_record import ContactRecord, Start
 from tactile_resonance.calibration.law import ContactPrior, ContactStiffness, Law
-from tactile_resonance.calibration.model import Calibration, ComplexArray, FloatArray, SensorModel
+from tactile_resonance.calibration.model import Calibration, SensorModel
 from tactile_resonance.fields import require
 from tactile_resonance.poles.result import (
     Poles,

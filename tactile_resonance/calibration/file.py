@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.calibration.model import PER_MODE, SINGLE, Calibration, SensorModel
 from tactile_resonance.fields import (
     check_above_zero,
@@ -122,16 +122,16 @@ class _File:
     noise_v_per_root_hz: float | None
     excess: float
     message: str
-    natural_rad_s: npt.NDArray[np.float64]
-    damping_ratio: npt.NDArray[np.float64]
-    coupling_rad_s: npt.NDArray[np.float64]
-    tip_deflection: npt.NDArray[np.float64]
+    natural_rad_s: FloatArray
+    damping_ratio: FloatArray
+    coupling_rad_s: FloatArray
+    tip_deflection: FloatArray
     feedthrough: float
     leak_rad_s: float
     gain: float
     delay_s: float
     determined: tuple[bool, ...]
-    covariance: npt.NDArray[np.float64]
+    covariance: FloatArray
     tip_mass_kg: float | None = None
     tip_mass_std_kg: float | None = None
 

@@ -14,17 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import optimize
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
-from tactile_resonance.calibration.model import (
-    PER_MODE,
-    Calibration,
-    ComplexArray,
-    FloatArray,
-    SensorModel,
-)
+from tactile_resonance.calibration.model import PER_MODE, Calibration, SensorModel
 from tactile_resonance.calibration.start import one_above, start_channel, start_in_air, start_tip
 from tactile_resonance.fields import require
 
@@ -149,7 +143,7 @@ class _Records:
         self.limits[3 * n : 4 * n] = UNDETERMINED * np.where(scale > 0, scale, 1.0)
         return np.concatenate([self.centre, np.zeros(len(self.known))])
 
-    def _logarithmic(self) -> npt.NDArray[np.bool_]:
+    def _logarithmic(self) -> BoolArray:
         n = self.modes
         log = np.zeros(4 * n + 4, bool)
         log[: 3 * n] = log[4 * n + 1] = log[4 * n + 2] = True

@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
+from tactile_resonance._typing import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

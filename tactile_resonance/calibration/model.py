@@ -21,10 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.calibration.law import ContactStiffness
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 PER_MODE = ("natural_rad_s", "damping_ratio", "coupling_rad_s", "tip_deflection")
 SINGLE = ("feedthrough", "leak_rad_s", "gain", "delay_s")
@@ -183,7 +181,7 @@ class Calibration:
 
     model: SensorModel
     covariance: FloatArray
-    determined: npt.NDArray[np.bool_]
+    determined: BoolArray
     band_hz: tuple[float, float]
     noise_v_per_root_hz: float
     excess: float

@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import signal
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
-from tactile_resonance.calibration.model import ComplexArray, FloatArray, SensorModel
+from tactile_resonance.calibration.model import SensorModel
 from tactile_resonance.fields import require
 
 PEAK_HEIGHT = 0.15

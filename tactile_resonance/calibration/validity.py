@@ -14,8 +14,9 @@ from enum import Enum
 import numpy as np
 from scipy import special
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.calibration.law import AIR
-from tactile_resonance.calibration.model import Calibration, FloatArray, SensorModel
+from tactile_resonance.calibration.model import Calibration, SensorModel
 from tactile_resonance.fields import require
 from tactile_resonance.poles.result import natural_frequency_and_damping
 

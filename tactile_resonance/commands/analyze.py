@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import IntArray
 from tactile_resonance.analysis import (
     POLES_METHODS,
     Analysis,
@@ -196,7 +196,7 @@ def parse_segments(text: str) -> list[tuple[int, int]]:
         ) from None
 
 
-def parse_harmonics(text: str) -> npt.NDArray[np.int64]:
+def parse_harmonics(text: str) -> IntArray:
     """'3,10:20:5' as [3, 10, 15, 20]."""
     found: set[int] = set()
     try:

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.moving_surface import SPEED_STD_M_S, MovingSurface
 
 RIGID = math.inf
@@ -60,8 +60,6 @@ def hertz_depth(force_n: float, c: float, beam_n_per_m: float = RIGID) -> float:
         return 0.0
     return (force_n / c) ** (2 / 3) + force_n / beam_n_per_m
 
-
-FloatArray = NDArray[np.float64]
 
 RATE_MEAN_PER_S, RATE_STD_PER_S = -0.4, 0.5
 """d ln C / dt at first touch: brain and liver lose 0.2 to 1.2 of their stiffness per second."""

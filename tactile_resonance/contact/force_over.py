@@ -17,15 +17,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.force_spread import ForceSpread, spread_of
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import Vector, vector
 from tactile_resonance.fields import require
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 GAP_PERIODS = 3
 """Wrenches further apart than so many of their nominal periods say nothing of the time between them."""

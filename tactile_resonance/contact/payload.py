@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import (
     ZERO,
     Six,
@@ -25,8 +25,6 @@ from tactile_resonance.contact.vectors import (
     scaled,
     vector,
 )
-
-FloatArray = NDArray[np.float64]
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, -9.80665])
 """Standard gravity in a base that stands upright."""

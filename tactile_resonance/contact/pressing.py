@@ -10,8 +10,8 @@ import math
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.envelope import Place
 from tactile_resonance.contact.estimator import ContactFilter
 from tactile_resonance.contact.goal import ContactGoal, Move, State, failed
@@ -21,8 +21,6 @@ from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, 
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import TipPath
-
-FloatArray = NDArray[np.float64]
 
 EVERY_NS, NEWEST = 20_000_000, 1000
 """Of the tip's heights one is kept in so long [ns]; so many, the newest."""

@@ -11,11 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
-
-FloatArray = NDArray[np.float64]
 
 
 class PolesTouch:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import (
     Six,
     Turn,
@@ -41,8 +41,8 @@ class Pose:
         Rotation vector: axis times angle [rad].
     """
 
-    position_m: NDArray[np.float64]
-    rotation_rad: NDArray[np.float64]
+    position_m: FloatArray
+    rotation_rad: FloatArray
 
     @classmethod
     def at_origin(cls) -> Pose:
@@ -50,12 +50,12 @@ class Pose:
         return cls(np.zeros(3), np.zeros(3))
 
     @classmethod
-    def from_vector(cls, vector: NDArray[np.float64]) -> Pose:
+    def from_vector(cls, vector: FloatArray) -> Pose:
         """Take the six numbers of a UR pose, position [m] and rotation vector [rad]."""
         return cls(np.array(vector[:3], dtype=float), np.array(vector[3:], dtype=float))
 
     @property
-    def vector(self) -> NDArray[np.float64]:
+    def vector(self) -> FloatArray:
         """The six numbers of a UR pose, shape (6,)."""
         return np.concatenate([self.position_m, self.rotation_rad])
 

@@ -8,12 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import WrenchSample
-
-FloatArray = NDArray[np.float64]
 
 FEWEST = 20
 

@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.tare import Tare
-
-FloatArray = NDArray[np.float64]
 
 STEPPED = 4.0
 """Deviations beyond which the zero has not walked, but stepped."""

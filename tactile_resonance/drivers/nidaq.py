@@ -16,8 +16,8 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.drivers.nidaq_config import TERMINALS, InputChannel, NiDaqConfig
 from tactile_resonance.drivers.nidaq_scale import CountScale
@@ -266,7 +266,7 @@ class NiDaqDevice:
             max_val=channel.range_v,
         )
 
-    def _make_output(self, period: npt.NDArray[np.float64]) -> Any:
+    def _make_output(self, period: FloatArray) -> Any:
         """The period, repeated on the inputs' clock from the inputs' start on."""
         clock = f"/{self._config.clock}/ai"
         task = self._daq.Task()

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import polynomial
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.record import Channel
 
@@ -35,7 +36,7 @@ class CountScale:
 
     def __init__(
         self,
-        coefficients: npt.NDArray[np.float64],
+        coefficients: FloatArray,
         limits_v: tuple[float, float],
         dtype: type[np.signedinteger],
     ) -> None:

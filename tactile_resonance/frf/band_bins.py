@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tactile_resonance.frf.spectra import ComplexArray, IntArray, Spectrum
+from tactile_resonance._typing import ComplexArray, IntArray
+from tactile_resonance.frf.spectra import Spectrum
 
 
 @dataclass(frozen=True, eq=False)

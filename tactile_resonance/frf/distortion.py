@@ -10,16 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.estimate import mean_spectra
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.frf.spectra import (
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    PeriodicSpectra,
-    Spectrum,
-    error_variance,
-)
+from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, error_variance
 from tactile_resonance.multisine import Excitation, Grid
 
 DETECTING = (Grid.ODD, Grid.ODD_RANDOM)
@@ -64,7 +58,7 @@ class DetectionLines:
     noise_dof: int
 
     @property
-    def in_band(self) -> npt.NDArray[np.bool_]:
+    def in_band(self) -> BoolArray:
         """(L,) lines inside the excited band."""
         return np.all(np.isfinite(self.corrected), axis=tuple(range(self.corrected.ndim - 1)))
 
@@ -111,7 +105,7 @@ class DetectionLines:
         return _rms_ratio_db(power, self.excited_input_power, self.in_band)
 
     @property
-    def above_noise(self) -> npt.NDArray[np.bool_] | None:
+    def above_noise(self) -> BoolArray | None:
         """(...) True where the in-band lines hold more than noise, at `FALSE_ALARM`.
 
         None where it cannot be estimated: single periods, or no line of this parity.
@@ -355,9 +349,7 @@ def decibel(power_ratio: npt.ArrayLike) -> FloatArray:
         return 10 * np.log10(np.asarray(power_ratio, float))
 
 
-def _rms_ratio_db(
-    power: FloatArray, reference: FloatArray, inside: npt.NDArray[np.bool_]
-) -> FloatArray:
+def _rms_ratio_db(power: FloatArray, reference: FloatArray, inside: BoolArray) -> FloatArray:
     if not np.any(inside):
         return np.full(power.shape[:-1], np.nan)
     return decibel(power[..., inside].mean(axis=-1) / reference[..., inside].mean(axis=-1))

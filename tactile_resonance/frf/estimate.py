@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray
 from tactile_resonance.frf.local_polynomial import kept_plan
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.spectra import (
-    ComplexArray,
     PeriodicSpectra,
     Spectrum,
     averaged_spectra,

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage, special
 
-from tactile_resonance.frf.spectra import FloatArray, IntArray, Spectrum, power
+from tactile_resonance._typing import BoolArray, FloatArray, IntArray
+from tactile_resonance.frf.spectra import Spectrum, power
 
 GAP_DB = 15.0
 """A step this large between neighbouring sorted levels parts excited lines from distortion [dB]."""
@@ -97,7 +97,7 @@ def find_excited_harmonics(record: Spectrum) -> IntArray:
     return harmonics[candidate & (level_db > cut_db)].astype(np.int64)
 
 
-def _above_a_step(level_db: FloatArray) -> npt.NDArray[np.bool_]:
+def _above_a_step(level_db: FloatArray) -> BoolArray:
     """(H,) lines above the last step of `GAP_DB` that has `_FEWEST_BELOW` lines or more below it."""
     order = np.argsort(level_db)
     steps = np.flatnonzero(np.diff(level_db[order]) >= GAP_DB)
@@ -109,8 +109,8 @@ def _above_a_step(level_db: FloatArray) -> npt.NDArray[np.bool_]:
 
 def _cut_level(
     level_db: FloatArray,
-    candidate: npt.NDArray[np.bool_],
-    among: npt.NDArray[np.bool_],
+    candidate: BoolArray,
+    among: BoolArray,
     *,
     needs_step: bool,
 ) -> float | None:

@@ -14,8 +14,9 @@ import numpy.typing as npt
 import scipy.fft
 from scipy import special
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.frf.spectra import ComplexArray, FloatArray, Spectrum
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.tones import MAINS_HZ, ROUNDING
 
 SHARE_AT_TOP = 1 / np.sqrt(2)
@@ -412,7 +413,7 @@ def _clipped(record: FloatArray, periods: int) -> int:
     return top if chance < _FALSE_ALARM else 0
 
 
-def _runs(record: FloatArray) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _runs(record: FloatArray) -> tuple[IntArray, IntArray]:
     """First index and length of each run of equal samples."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(record) != 0) + 1])
     return starts, np.diff(np.append(starts, record.size))

@@ -17,15 +17,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.spectra import (
-    NOT_FINITE,
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    PeriodicSpectra,
-    Spectrum,
-    checked_harmonics,
-)
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
+from tactile_resonance.frf.spectra import NOT_FINITE, PeriodicSpectra, Spectrum, checked_harmonics
 
 
 class LocalPolynomialPlan:

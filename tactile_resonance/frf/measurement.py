@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.force_spread import joined_spread
 from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
 from tactile_resonance.frf.distortion import DETECTING, band_lines, distortion_in_band
@@ -16,13 +17,7 @@ from tactile_resonance.frf.estimate import fast_frf, mean_spectra, robust_frf
 from tactile_resonance.frf.faults import Fault, FaultKind, FaultReport, find_faults
 from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus
 from tactile_resonance.frf.skew import correct_skew
-from tactile_resonance.frf.spectra import (
-    FloatArray,
-    IntArray,
-    PeriodicSpectra,
-    Spectrum,
-    stacked_spectra,
-)
+from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, stacked_spectra
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.record import Contact, Origin, Record

@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.frf.spectra import ComplexArray, FloatArray
 from tactile_resonance.poles.structure import PoleBand
 
 PER_LINE = (

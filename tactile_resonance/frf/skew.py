@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.frf.estimate import fast_frf
 from tactile_resonance.frf.faults import Fault, FaultKind
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import ComplexArray, FloatArray, Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 
 NOT_FINITE = "u, y: samples are not finite, expected a complete record"
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.frf.distortion import decibel
 from tactile_resonance.frf.nested import nested_means
-from tactile_resonance.frf.spectra import ComplexArray, FloatArray
 
 PAPER_AXES = ("preparation", "position", "repetition", "period")
 """Sources of figure 9 of arXiv 1805.00682, outermost first."""

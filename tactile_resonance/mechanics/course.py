@@ -22,7 +22,8 @@ from numba import njit
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from tactile_resonance.mechanics.indentation import BallTip, FloatArray
+from tactile_resonance._typing import FloatArray
+from tactile_resonance.mechanics.indentation import BallTip
 
 NEWTON_STEPS = 8
 """Of a cubic that is convex where it is solved: from above Newton's method comes down to the root."""

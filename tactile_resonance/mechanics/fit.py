@@ -18,17 +18,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.mechanics.course import layer_share, sphere_share
 from tactile_resonance.mechanics.indentation import IndentationRecord, means_of
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.mechanics.result import Fit, Known, Term
 from tactile_resonance.mechanics.series_problem import SeriesProblem, SeriesSolution
-
-FloatArray = NDArray[np.float64]
 
 MOST_TERMS = 4
 SHOWN, SURE = 2.5, 2.0

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.fields import check_above_zero, check_within, require
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -254,7 +252,7 @@ def _noise_of(test: IndentationRecord) -> float:
     return max(noise, 1e-9 * float(np.abs(test.force_n).max()))
 
 
-def _mean(values: FloatArray, edges: NDArray[np.int64]) -> FloatArray:
+def _mean(values: FloatArray, edges: IntArray) -> FloatArray:
     """(len(edges) - 1,) means between samples."""
     if edges.size < 2:
         return np.zeros(0)

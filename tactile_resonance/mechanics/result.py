@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.mechanics.prony import Prony
-
-FloatArray = NDArray[np.float64]
 
 
 class Known(str, Enum):

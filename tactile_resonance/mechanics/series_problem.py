@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.mechanics.course import course_of
 from tactile_resonance.mechanics.indentation import IndentationRecord, Means
-
-FloatArray = NDArray[np.float64]
 
 FAST = 1 / 8
 """Time constant of what stands for all faster terms, over the duration of the ramp."""
@@ -227,7 +225,7 @@ class SeriesProblem:
         return np.stack(columns, axis=1)
 
 
-def _nodes(means: Means) -> tuple[FloatArray, FloatArray, NDArray[np.int64], int]:
+def _nodes(means: Means) -> tuple[FloatArray, FloatArray, IntArray, int]:
     """Times and depths of the nodes, dense where the robot moves, the place of each mean, and the turn."""
     time, depth = means.time_s, means.depth_m
     most = depth.max() / 40

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.processes import end_with_parent, may_take_priority
 from tactile_resonance.simulation.plant.defaults import PRIORITY, READY
 from tactile_resonance.simulation.plant.simulated_robot import order
@@ -46,8 +46,8 @@ class TrueContact:
         How often the simulation has stood still on the wall clock for more than 10 ms.
     """
 
-    tip_m: NDArray[np.float64]
-    site_m: NDArray[np.float64]
+    tip_m: FloatArray
+    site_m: FloatArray
     force_n: float
     contact_radius_m: float
     depth_m: float

@@ -4,15 +4,14 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from tactile_resonance import msg
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.resonance_touch import PolesTouch
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import poles_from_message
 
-FloatArray = npt.NDArray[np.float64]
 IN_AIR = (State.IDLE, State.TRAVEL, State.TARE)
 FORGOTTEN_NS = 1_000_000_000
 """So long after the tip left the tissue a record may still show it: stamps err, and the bench plays ahead."""

@@ -15,11 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.likelihood import BLOCK, Arrays, planes
 from tactile_resonance.poles.tables import Tables, compiled, from_planes, in_blocks
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +120,7 @@ class BinData:
         u: npt.NDArray,
         undriven: int,
         *variances: Any,
-        order: npt.NDArray[np.int64] | None = None,
+        order: IntArray | None = None,
     ) -> BinData:
         """Data (points, M, K), of which the undriven bins come first, or do in `order`."""
         order = np.arange(y.shape[-1]) if order is None else order

@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.result import (
-    ComplexArray,
-    FloatArray,
     natural_frequency_and_damping,
     natural_frequency_and_damping_jacobian,
 )

@@ -11,16 +11,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.noise_level import LEAST_VARIANCE, two_channels
 from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
 from tactile_resonance.poles.single_point import single
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 
 DISTURBED = 1e-2
 """Power of the input between harmonics over that on the excited lines from which all bins are tried: less

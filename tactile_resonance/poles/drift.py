@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 from numpy.polynomial import legendre
 from scipy import special
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.covariance import f0_damping_covariance, real_covariance
 from tactile_resonance.poles.fit import Linearised
@@ -35,9 +35,6 @@ from tactile_resonance.poles.result import (
     natural_frequency_and_damping_jacobian,
 )
 from tactile_resonance.poles.single_point import single
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 # How often a constant mode is found to change.
 FALSE_ALARM = 2e-5
@@ -122,7 +119,7 @@ class DriftingModes:
     u: ComplexArray
 
     @property
-    def there(self) -> npt.NDArray[np.int64]:
+    def there(self) -> IntArray:
         """(m,) places of modes."""
         return np.flatnonzero(np.isfinite(self.fit.poles_rad_s))
 

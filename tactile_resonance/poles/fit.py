@@ -14,13 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.bins import BinData, Problem
 from tactile_resonance.poles.likelihood import LINEAR, LINEAR_UNWEIGHTED
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-BoolArray = npt.NDArray[np.bool_]
 
 MAX_ITERATIONS = 60
 # A step below this many standard deviations, as the residuals show them, is the last one taken.

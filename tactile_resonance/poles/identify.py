@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.covariance import modes_in_band
@@ -16,12 +16,7 @@ from tactile_resonance.poles.line_weights import lines_of_frf, lines_of_spectra
 from tactile_resonance.poles.lines_fit import LinesPlan
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, systematic_of
 from tactile_resonance.poles.noise_level import KINDS, VarianceModel
-from tactile_resonance.poles.result import (
-    ComplexArray,
-    FloatArray,
-    Poles,
-    PolesBatch,
-)
+from tactile_resonance.poles.result import Poles, PolesBatch
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
 from tactile_resonance.poles.transient_left import with_transient_judged
@@ -219,13 +214,13 @@ def _identify(
     frequency_hz: FloatArray,
     data: BinData,
     known: VarianceModel,
-    usable: npt.NDArray[np.bool_],
+    usable: BoolArray,
     structure: ModelStructure,
     band_hz: tuple[float, float],
     *,
     shape: tuple[int, ...],
     method: str,
-    level_known: npt.NDArray[np.bool_],
+    level_known: BoolArray,
     noise: FloatArray | None = None,
     total_known: bool = False,
 ) -> PolesBatch:
@@ -284,7 +279,7 @@ def _identify(
     return assemble(judged, fit.model, structure, band_hz, shape, method)
 
 
-def _nothing(plan: LinesPlan, lines: npt.NDArray[np.int64]) -> Judged:
+def _nothing(plan: LinesPlan, lines: IntArray) -> Judged:
     """Of too few lines: NaN."""
     batch, structure = lines.size, plan.structure
     nan, no = np.full(batch, np.nan), np.zeros(batch, bool)
@@ -309,6 +304,6 @@ def _nothing(plan: LinesPlan, lines: npt.NDArray[np.int64]) -> Judged:
     )
 
 
-def _where(rows: npt.NDArray[np.bool_], those: FloatArray, others: FloatArray) -> FloatArray:
+def _where(rows: BoolArray, those: FloatArray, others: FloatArray) -> FloatArray:
     """(batch, n, n) matrices of some points, and of the others."""
     return np.where(rows[:, None, None], those, others)

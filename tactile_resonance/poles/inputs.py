@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.result import FRF
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 # Of a covariance that is Hermitian and positive semidefinite but for rounding to single precision.
 ROUNDING = 1e-5

@@ -21,6 +21,7 @@ from numbers import Integral, Real
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.basis import (
     PolynomialBasis,
@@ -39,11 +40,6 @@ from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, richer
 from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.structure import ModelStructure
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 METHOD = "joint maximum likelihood of poles and transient"
 

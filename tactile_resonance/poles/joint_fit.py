@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.fit import Solution, minimise, refit_failed
 from tactile_resonance.poles.joint_noise import with_noise
@@ -31,10 +31,6 @@ from tactile_resonance.poles.whiteness import are_smooth
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 
 # Records that are fitted together: enough for what a call costs, few enough for the cache.
 CHUNK = 1000

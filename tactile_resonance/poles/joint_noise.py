@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.noise_level import FALSE_ALARM, are_flat, model_variance
@@ -20,9 +20,6 @@ from tactile_resonance.poles.noise_level import FALSE_ALARM, are_flat, model_var
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 
 # Bins whose powers are averaged before their variances are compared with each other.
 BINS_PER_BAND = 8

@@ -10,21 +10,15 @@ from functools import lru_cache, partial
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, IntArray
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.poles.disturbed_input import poles_with_all_bins
 from tactile_resonance.poles.drift import poles_with_drift
-from tactile_resonance.poles.joint import (
-    ComplexArray,
-    JointPlan,
-    PoleEstimator,
-    whole_harmonics,
-)
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator, whole_harmonics
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tones import PlanOf, poles_without_tones
-
-IntArray = npt.NDArray[np.int64]
 
 
 def identify_poles_from_records(

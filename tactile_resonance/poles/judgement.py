@@ -8,21 +8,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.covariance import pole_quantities
 from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.model_error import model_error_factor
 from tactile_resonance.poles.noise_level import KINDS
-from tactile_resonance.poles.result import (
-    STATUS_CODE,
-    ComplexArray,
-    FloatArray,
-    PolesBatch,
-    PolesStatus,
-)
+from tactile_resonance.poles.result import STATUS_CODE, PolesBatch, PolesStatus
 from tactile_resonance.poles.significance import significant_modes
 from tactile_resonance.poles.structure import ModelStructure
-
-BoolArray = npt.NDArray[np.bool_]
 
 # Beyond this the parameters have no figure left in double precision.
 LARGEST_CONDITION_NUMBER = 1e12
@@ -69,7 +62,7 @@ class Judged:
     """
 
     theta: FloatArray
-    lines: npt.NDArray[np.int64]
+    lines: IntArray
     condition: FloatArray
     converged: BoolArray
     residual: ComplexArray
@@ -78,14 +71,14 @@ class Judged:
     suspect: BoolArray
     covariance: FloatArray
     total: FloatArray
-    kind: npt.NDArray[np.int64]
+    kind: IntArray
     level_known: BoolArray
     noise: FloatArray
     systematic: FloatArray
     lacking: FloatArray
     remark: npt.NDArray[np.object_]
 
-    def rows(self, which: npt.NDArray[np.int64]) -> Judged:
+    def rows(self, which: IntArray) -> Judged:
         """Some of the points."""
         return Judged(*(getattr(self, f.name)[which] for f in fields(Judged)))
 
@@ -97,7 +90,7 @@ class Judged:
         names = [f.name for f in fields(cls)]
         return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
-    def replaced(self, rows: npt.NDArray[np.int64], others: Judged) -> Judged:
+    def replaced(self, rows: IntArray, others: Judged) -> Judged:
         """With some points of another batch."""
         if rows.size == self.lines.size:
             return others
@@ -208,7 +201,7 @@ def assemble(
     )
 
 
-def _lost_to_rounding(covariance: FloatArray) -> npt.NDArray[np.bool_]:
+def _lost_to_rounding(covariance: FloatArray) -> BoolArray:
     """(batch,) where a variance of a mode's covariance (batch, k, 2, 2) is not above 0.
 
     A mode beside its own zero leaves the normal matrix all but singular.

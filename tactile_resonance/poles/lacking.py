@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.likelihood import best_fall
@@ -24,9 +24,6 @@ from tactile_resonance.poles.whiteness import are_smooth
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 # How often each of the two tests finds something lacking in a model that is complete.
 FALSE_ALARM = 2e-4

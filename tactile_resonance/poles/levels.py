@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.fit import RecordsInverse, Solution
 from tactile_resonance.poles.joint_noise import BINS_PER_BAND
 from tactile_resonance.poles.likelihood import invert
@@ -20,9 +20,6 @@ from tactile_resonance.poles.scatter import Pieces, Scatter
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 # Noise alone looks like distortion this often; it is then weighted as such, at next to no loss.
 DISTORTION_PROBABILITY = 1e-2

@@ -30,9 +30,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
+from tactile_resonance._typing import FloatArray
 
 OPTIONS: dict[str, Any] = {
     "cache": True,

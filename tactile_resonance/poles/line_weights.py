@@ -7,15 +7,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.noise_level import VarianceModel, model_variance
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-BoolArray = npt.NDArray[np.bool_]
 
 # Degrees of freedom that stand for a covariance known exactly.
 EXACT = 10**6

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.bins import BinData, Problem
@@ -29,9 +29,6 @@ from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, richer
 from tactile_resonance.poles.split import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.structure import ModelStructure
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 # Beyond this condition number normal equations are not trusted and the Jacobian itself is
 # factorised.
@@ -69,7 +66,7 @@ class LinesFit:
     cost: FloatArray
     covariance: FloatArray
     condition_number: FloatArray
-    converged: npt.NDArray[np.bool_]
+    converged: BoolArray
     residual: ComplexArray
     jacobian: FloatArray | None = None
 

@@ -8,12 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles.bins import BinData
-from tactile_resonance.poles.result import (
-    ComplexArray,
-    FloatArray,
-    natural_frequency_and_damping,
-)
+from tactile_resonance.poles.result import natural_frequency_and_damping
 from tactile_resonance.poles.structure import ModelStructure
 
 if TYPE_CHECKING:

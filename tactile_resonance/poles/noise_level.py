@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
-FloatArray = npt.NDArray[np.float64]
+from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 
 # Bartlett's test rejects a flat variance wrongly in one of ten thousand bands.
 FALSE_ALARM = 1e-4
@@ -45,9 +44,9 @@ class VarianceModel:
     """
 
     variance: FloatArray
-    lines: npt.NDArray[np.int64]
+    lines: IntArray
     dof: int
-    kind: npt.NDArray[np.int64]
+    kind: IntArray
     independent_dof: float | None = None
 
     @property
@@ -75,9 +74,7 @@ class VarianceModel:
         """(batch,) expectation of ``sum |e|^2 / s^2`` with noise alone; NaN where it has none."""
         return (self.lines - parameters / 2) * student_variance(self.pooled_dof)
 
-    def contradicts(
-        self, cost: FloatArray, parameters: int, probability: float
-    ) -> npt.NDArray[np.bool_]:
+    def contradicts(self, cost: FloatArray, parameters: int, probability: float) -> BoolArray:
         """(batch,) whether noise alone exceeds a cost more rarely; False where that cannot be determined."""
         free = np.maximum(self.lines - parameters / 2, 0.5)
         chance = special.fdtrc(2 * free, 2 * self.pooled_dof, cost / free)
@@ -153,7 +150,7 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
     return VarianceModel(model, lines, dof, kind)
 
 
-def are_flat(variance: FloatArray, dof: int) -> npt.NDArray[np.bool_]:
+def are_flat(variance: FloatArray, dof: int) -> BoolArray:
     """(...) whether the test of `model_variance` finds variances (..., F) flat."""
     lines = variance.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -168,7 +165,7 @@ def flat_limit(lines: int, dof: int) -> float:
     return float(_bartlett_limit(np.array(lines), dof, 1))
 
 
-def _bartlett_limit(lines: npt.NDArray[np.int64], dof: int, parameters: int) -> FloatArray:
+def _bartlett_limit(lines: IntArray, dof: int, parameters: int) -> FloatArray:
     """Largest ``log mean - mean log`` of variance ratios that passes the test."""
     real_dof = 2 * dof
     count = np.maximum(lines, parameters + 1).astype(float)
@@ -177,9 +174,7 @@ def _bartlett_limit(lines: npt.NDArray[np.int64], dof: int, parameters: int) -> 
     return quantile * correction / (real_dof * count)
 
 
-def two_channels(
-    variance: FloatArray, gain: FloatArray, usable: npt.NDArray[np.bool_]
-) -> FloatArray:
+def two_channels(variance: FloatArray, gain: FloatArray, usable: BoolArray) -> FloatArray:
     """(batch, F) fit of ``a + b gain``, neither negative, to gamma distributed variances.
 
     Iteratively reweighted least squares is maximum likelihood here: the variance of a gamma
@@ -212,7 +207,7 @@ def two_channels(
     return model * scale
 
 
-def log_linear(variance: FloatArray, usable: npt.NDArray[np.bool_]) -> FloatArray:
+def log_linear(variance: FloatArray, usable: BoolArray) -> FloatArray:
     """(batch, F) maximum likelihood fit of ``exp(c_0 + c_1 x)`` to gamma distributed variances.
 
     By Fisher scoring, over the usable lines.

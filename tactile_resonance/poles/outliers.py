@@ -10,14 +10,10 @@ spread over many bins, are no outliers.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.tones import level_around
-
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 FALSE_ALARM = 1e-4
 """Probability that noise of a record has a bin taken for a tone."""

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.covariance import real_rows
 from tactile_resonance.poles.likelihood import invert, moments
@@ -24,9 +25,6 @@ from tactile_resonance.poles.result import natural_frequency_and_damping_jacobia
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 # Scatter that chance makes more often says nothing; the rarer it is, the more it counts. A test that is
 # passed or not would pass differences of the size of the noise, and ellipses would hold 80 to 90 %.

@@ -9,12 +9,10 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.whiteness import whiteness
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 
 class PolesStatus(Enum):
@@ -256,8 +254,8 @@ class PolesBatch:
     expected_cost: FloatArray
     condition_number: FloatArray
     residual: ComplexArray
-    lines: npt.NDArray[np.int64]
-    significant: npt.NDArray[np.bool_]
+    lines: IntArray
+    significant: BoolArray
     status_code: npt.NDArray[np.uint8]
     noise_variance: FloatArray
     lacking: FloatArray
@@ -278,7 +276,7 @@ class PolesBatch:
         """(...) how much smoother the residuals are than white ones; see `whiteness.whiteness`."""
         return whiteness(self.residual, self.structure.parameters)
 
-    def has_status(self, status: PolesStatus) -> npt.NDArray[np.bool_]:
+    def has_status(self, status: PolesStatus) -> BoolArray:
         """(...) which points have a status."""
         return self.status_code == STATUS_CODE[status]
 

@@ -12,16 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.noise_level import (
     log_linear,
     model_variance,
     two_channels,
 )
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 # Degrees of freedom that a variance known from a piece of the band alone should have, and the fewest.
 PIECE_DOF = 24
@@ -86,9 +83,9 @@ class Pieces:
     """
 
     lines: int
-    starts: npt.NDArray[np.int64]
-    counts: npt.NDArray[np.int64]
-    of_line: npt.NDArray[np.int64]
+    starts: IntArray
+    counts: IntArray
+    of_line: IntArray
     dof: int
 
     @classmethod
@@ -110,7 +107,7 @@ class Pieces:
 
 def smooth_variance(
     sample: FloatArray, gain: FloatArray, pieces: Pieces
-) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+) -> tuple[FloatArray, IntArray]:
     """Variance on each line from sample variances, and its kind as index into `KINDS`.
 
     Flat on both channels unless a test says otherwise, then sloped, then piece by piece.

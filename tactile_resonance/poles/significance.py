@@ -9,11 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.covariance import real_covariance
 from tactile_resonance.poles.model import RationalModel
-from tactile_resonance.poles.result import ComplexArray, FloatArray
-
-BoolArray = npt.NDArray[np.bool_]
 
 # A mode that noise makes is taken for one this often.
 NOISE_PASSES_FOR_A_MODE = 1e-4
@@ -26,7 +24,7 @@ def significant_modes(
     model: RationalModel,
     quantities: dict[str, npt.NDArray],
     coefficients: FloatArray,
-    lines: npt.NDArray[np.int64],
+    lines: IntArray,
 ) -> BoolArray:
     """(batch, k) modes that noise alone would not make; those whose covariance is not known are kept.
 
@@ -73,7 +71,7 @@ def significant_modes(
     return found
 
 
-def _neighbours(poles: ComplexArray, there: BoolArray) -> list[npt.NDArray[np.int64]]:
+def _neighbours(poles: ComplexArray, there: BoolArray) -> list[IntArray]:
     """Places of two or more poles (k,) each, in ascending order, that are nearer than their widths."""
     places = np.flatnonzero(there)
     width = np.abs(poles[places].real)

@@ -10,14 +10,11 @@ from __future__ import annotations
 from dataclasses import fields
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.bins import BinData, Problem
 from tactile_resonance.poles.fit import MAX_ITERATIONS, Linearised, Solution, minimise
 from tactile_resonance.poles.model import RationalModel
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 SEVERAL_MODES = 4
 """Order from which on a model has more than one mode."""
@@ -62,7 +59,7 @@ def best_of_split(
 @np.errstate(all="ignore")
 def _split_starts(
     problem: Problem, data: BinData, model: RationalModel
-) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+) -> tuple[FloatArray, BoolArray]:
     """(points, M, n) coefficients, and for which points there are such."""
     a, b, own = problem.sizes
     shared, records = a + b, data.records

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba.core import event
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.likelihood import (
     BLOCK,
@@ -31,10 +32,6 @@ from tactile_resonance.poles.likelihood import (
     ROW_OF_B,
     ROW_OF_C,
 )
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 
 CACHE_LINE = 64  # bytes
 

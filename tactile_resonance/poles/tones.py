@@ -12,11 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.outliers import (
     FALSE_ALARM,
@@ -27,10 +27,6 @@ from tactile_resonance.poles.outliers import (
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.tones import ROUNDING, Tone
 
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
 PlanOf = Callable[[tuple[int, ...]], JointPlan]
 
 NEAR_BINS = 0.75

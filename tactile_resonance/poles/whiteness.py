@@ -14,12 +14,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-IntArray = npt.NDArray[np.int64]
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 
 # Residuals of noise alone are smoother than this once in a thousand fits.
 SMOOTH_RESIDUAL = 3.09
@@ -77,7 +74,7 @@ def whiteness(residual: ComplexArray, parameters: int) -> FloatArray:
 
 def are_smooth(
     residual: ComplexArray, parameters: int, limit: float = SMOOTH_RESIDUAL
-) -> npt.NDArray[np.bool_]:
+) -> BoolArray:
     """(...) whether the `whiteness` of residuals (..., F) is beyond `limit`."""
     score, levels = _best_level(residual, parameters)
     return np.asarray(score > _limit(levels, limit))

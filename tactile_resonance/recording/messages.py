@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
@@ -361,7 +362,7 @@ def optional(values: Any) -> npt.NDArray | None:
     return array_of(values) if len(values) else None
 
 
-def complex_of(message: Any, prefix: str, suffix: str = "") -> npt.NDArray[np.complex128]:
+def complex_of(message: Any, prefix: str, suffix: str = "") -> ComplexArray:
     """Array whose parts are the fields ``real`` and ``imag`` between a prefix and a suffix."""
     real = array_of(getattr(message, f"{prefix}real{suffix}"))
     return real + 1j * array_of(getattr(message, f"{prefix}imag{suffix}"))
@@ -373,9 +374,7 @@ def fill(target: array.array, values: npt.ArrayLike) -> None:
     target.frombytes(whole.ravel().view(np.uint8).data)
 
 
-def fill_complex(
-    message: Any, prefix: str, values: npt.NDArray[np.complex128], suffix: str = ""
-) -> None:
+def fill_complex(message: Any, prefix: str, values: ComplexArray, suffix: str = "") -> None:
     """Fill the arrays of `complex_of`."""
     fill(getattr(message, f"{prefix}real{suffix}"), values.real)
     fill(getattr(message, f"{prefix}imag{suffix}"), values.imag)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import IntArray
 from tactile_resonance.fields import number, require, whole
 
 MIN_RATE_HZ, MAX_RATE_HZ = 1e-6, 1e12
@@ -32,7 +33,7 @@ class Recording:
     u: npt.NDArray[np.floating]
     y: npt.NDArray[np.floating]
     sample_rate_hz: float
-    excited_harmonics: npt.NDArray[np.int64] | None = None
+    excited_harmonics: IntArray | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -209,7 +210,7 @@ def _check_samples(samples: npt.NDArray[np.floating], name: str) -> None:
         raise ValueError(f"{name}: {bad} samples are NaN or infinite, expected finite voltages")
 
 
-def _harmonics(values: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64] | None:
+def _harmonics(values: npt.ArrayLike | None, n: int) -> IntArray | None:
     if values is None:
         return None
     array = np.asarray(values).ravel()

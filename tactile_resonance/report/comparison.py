@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 from scipy.spatial import cKDTree
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.report import run_tables as tables
 from tactile_resonance.report.boundary import RunBoundary
 from tactile_resonance.report.page import page
@@ -24,7 +24,6 @@ from tactile_resonance.scan.point_result import PointKind, PointResult
 from tactile_resonance.scan.pole_map import SAME_PLACE_M
 from tactile_resonance.scan.run_content import RunContent
 
-FloatArray = npt.NDArray[np.float64]
 SIGNIFICANT = 3.0
 """Standard deviations beyond which a difference is counted."""
 _RANGE = 6.0  # of the colours of differences, in standard deviations

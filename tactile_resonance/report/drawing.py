@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
 
@@ -49,7 +50,7 @@ def save_figure(figure: Figure, path: Path) -> None:
     write_whole(path, figure_bytes(figure, path.suffix))
 
 
-def decibel(power: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def decibel(power: npt.ArrayLike) -> FloatArray:
     """10 log10 of a power; NaN where it is not positive."""
     power = np.asarray(power, float)
     return 10 * np.log10(np.where(power > 0, power, np.nan))
@@ -58,7 +59,7 @@ def decibel(power: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def draw_ellipse(
     axes: Axes,
     centre: npt.ArrayLike,
-    covariance: npt.NDArray[np.float64],
+    covariance: FloatArray,
     **style: Any,
 ) -> None:
     """Ellipse that holds the truth with `PROBABILITY` if errors are Gaussian.

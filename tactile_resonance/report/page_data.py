@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import array_of, complex_of
 from tactile_resonance.scan.level_set import Lines
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from tactile_resonance.report.boundary import RunBoundary
     from tactile_resonance.scan.tissue_tests import TissueTest
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 MM, MN = 1e3, 1e3
 LOW, HIGH = ("#{:02x}{:02x}{:02x}".format(*rgb) for rgb in (LOW_RGB, HIGH_RGB))
 """Colours of the lowest and the highest value, those of rviz and `pole_map.png`."""
@@ -185,7 +184,7 @@ def frf_entry(message: Any, poles: Poles | None, most_lines: int) -> dict[str, A
 
 def shown_lines(
     frequency_hz: FloatArray, bands_hz: Iterable[Sequence[float]], most: int
-) -> npt.NDArray[np.int64]:
+) -> IntArray:
     """Indices of at most so many of the lines (F,), those of the bands first."""
     inside = np.zeros(frequency_hz.size, bool)
     for low, high in bands_hz:
@@ -195,7 +194,7 @@ def shown_lines(
     return np.sort(np.concatenate([within, _evenly(beside, most - within.size)]))
 
 
-def _evenly(indices: npt.NDArray[np.int64], most: int) -> npt.NDArray[np.int64]:
+def _evenly(indices: IntArray, most: int) -> IntArray:
     if indices.size <= most:
         return indices
     return indices[np.unique(np.linspace(0, indices.size - 1, max(most, 0)).round().astype(int))]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.frf.distortion import DetectionLines, estimate_distortion
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.recording.messages import array_of, complex_of
@@ -28,7 +29,6 @@ from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import BEFORE, read_reference
 from tactile_resonance.scan.run_content import RECORDING, RunContent, file_of
 
-FloatArray = npt.NDArray[np.float64]
 Figure = dict[str, Any]
 Trace = dict[str, Any]  # of plotly
 _COLOURS = ("#1f77b4", "#d95f02", "#1b9e77", "#7b3fa0", "#b8860b", "#c2185b", "#555555")

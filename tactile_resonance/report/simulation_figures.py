@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.cantilever import mode_shape
 from tactile_resonance.report.drawing import SIMULATED, new_figure
 from tactile_resonance.simulation.plant.tip import SprungIndenter
@@ -27,8 +27,6 @@ from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import TissueLibrary
 from tactile_resonance.simulation.tissue.scene import PhantomScene
 from tactile_resonance.simulation.tissue.shapes import Sphere
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def draw_tissues(bench: SimulatedBench, library: TissueLibrary, names: Sequence[str]) -> Figure:

@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.report.drawing import SIMULATED, draw_ellipse, new_figure
 from tactile_resonance.tissue.clusters import Clusters
 from tactile_resonance.tissue.differences import Differences
@@ -125,9 +125,6 @@ def _draw_sources(axes: Axes, spreads: Sequence[TissueSpread]) -> None:
     axes.set_ylim(top=3 * axes.get_ylim()[1])
     axes.legend(fontsize="small", ncols=len(names), loc="upper center")
     axes.grid(alpha=0.3, axis="y")
-
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def draw_comparison(

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.distance import cdist
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.fields import build, check_above_zero, check_within, read_dataclass, require
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
@@ -29,7 +29,6 @@ from tactile_resonance.scan.patterns import Pair, Places, grid, inside_polygon
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.tissue.classify import TissueClass
 
-FloatArray = npt.NDArray[np.float64]
 MOST_PLACES = 2500
 """The time to choose one grows with their square."""
 MOST_TOUCHES = 500
@@ -205,7 +204,7 @@ class Adaptive:
         self,
         surface: KrigedSurface,
         places_m: FloatArray,
-        free: npt.NDArray[np.int64],
+        free: IntArray,
         noise_hz: float,
     ) -> FloatArray:
         """(f,) loss that a touch at each free place is expected to take away, summed over the region."""

@@ -7,8 +7,8 @@ from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import poles_from_message
@@ -18,7 +18,6 @@ from tactile_resonance.scan.run_content import RunContent, file_of
 
 SAME_MIDDLE_NS = 50_000_000
 """Between the middles of an estimate and of its truth, at most."""
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim
@@ -27,7 +27,6 @@ from tactile_resonance.contact.vectors import vector
 from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
 from tactile_resonance.scan.surface import Surface
 
-FloatArray = npt.NDArray[np.float64]
 BEAM_PLACES = 32
 STEP_M, STEP_RAD = 1e-3, 0.02
 """Of the places on a way that are looked at."""

@@ -10,12 +10,12 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import check_above_zero, require
 from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
 from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
 
-FloatArray = npt.NDArray[np.float64]
 # Poles outside of both classes by this much are of neither, and no block more will change it.
 NEITHER_LEVEL = 1e-4
 # How far beyond what was asked the prediction for the last block must lie to give up before it: estimated

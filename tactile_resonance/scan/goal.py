@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import number, read_yaml, require
@@ -203,9 +203,7 @@ def _changes(goal: ScanGoal) -> dict[str, Any]:
     return changes
 
 
-def _poses_in_scene(
-    goal: ScanGoal, frame_id: str, place: Pose, frames: Frames
-) -> npt.NDArray[np.float64]:
+def _poses_in_scene(goal: ScanGoal, frame_id: str, place: Pose, frames: Frames) -> FloatArray:
     """(n, 7) places [m] and unit quaternions of the goal's poses, in the frame of the scene, of that place."""
     if not goal.poses:
         return np.zeros((0, 7))
@@ -225,7 +223,7 @@ def _poses_in_scene(
     return poses
 
 
-def _points(poses: npt.NDArray[np.float64], name: str) -> tuple[ScanPoint, ...]:
+def _points(poses: FloatArray, name: str) -> tuple[ScanPoint, ...]:
     normals = Rotation.from_quat(poses[:, 3:]).apply([0.0, 0.0, 1.0])  # (n, 3)
     return tuple(
         ScanPoint(

@@ -17,9 +17,9 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
 
-FloatArray = npt.NDArray[np.float64]
 LEAST_POINTS = 5
 # Length and size are fitted to so many points, evenly picked: the cost grows with the third power.
 FIT_POINTS = 100

@@ -17,15 +17,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from contourpy import LineType, contour_generator  # comes with matplotlib
 from scipy.special import ndtr, ndtri, owens_t
 
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.scan.kriging import KrigedSurface, TiledSurface
 from tactile_resonance.scan.patterns import inside_polygon
 
-FloatArray = npt.NDArray[np.float64]
 Lines = tuple[FloatArray, ...]
 PROBABILITY = 0.95
 """With which the boundary of a place lies in its band."""
@@ -84,7 +83,7 @@ class Raster:
 
     x_m: FloatArray
     y_m: FloatArray
-    within: npt.NDArray[np.bool_]
+    within: BoolArray
 
     @classmethod
     def over(cls, polygon_m: FloatArray, cell_m: float) -> Raster:

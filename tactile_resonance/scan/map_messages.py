@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.recording.messages import POLES_STATUS, write_header
 from tactile_resonance.scan.level_set import LevelSet
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, colours, shares
 
-FloatArray = npt.NDArray[np.float64]
 NO_CLASS = 255  # of the field tissue_class: none called, or unknown
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
 _FIELD, _MARKER = "sensor_msgs/msg/PointField", "visualization_msgs/msg/Marker"

@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.fields import cut, require
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _INSIDE = 1e-9  # of the barycentric coordinates: points on a shared edge belong to both triangles
 
@@ -83,7 +81,7 @@ class TriangleMesh:
         """(...) zeros."""
         return np.zeros(np.shape(xy_m)[:-1])
 
-    def known(self, xy_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
         """(...) over the mesh."""
         return ~np.isnan(self.height_m(xy_m))
 

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import build, check_above_zero, number, numbers, one_of, require
 
-FloatArray = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 Order = Literal["serpentine", "raster"]
 MOST_POINTS = 100_000
@@ -60,7 +60,7 @@ def spiral(center_m: npt.ArrayLike, radius_m: float, spacing_m: float) -> FloatA
     return np.asarray(np.asarray(center_m, float) + offset)
 
 
-def inside_polygon(xy_m: npt.ArrayLike, polygon_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+def inside_polygon(xy_m: npt.ArrayLike, polygon_m: npt.ArrayLike) -> BoolArray:
     """(...) whether (..., 2) positions lie in a polygon of (k, 2) corners, or on its edge.
 
     Even-odd rule, so that an edge that crosses another leaves a hole.

@@ -24,10 +24,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.poles.basis import default_transient_terms
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
-
-FloatArray = npt.NDArray[np.float64]
 
 FREE_LINES = 12
 """Excited lines of a band beyond those that its coefficients take up: the level of the noise is from them."""

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.scan.adaptive import known_points
 from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
@@ -20,7 +21,6 @@ from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.standoff import is_along, is_plane
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest
 
-FloatArray = npt.NDArray[np.float64]
 STEEPEST_RAD = np.pi / 3
 TRAVEL_M_S = 0.05
 CONTACT_S, NEAR_CONTACT_S = 2.2, 1.1

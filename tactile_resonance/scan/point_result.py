@@ -9,8 +9,8 @@ from enum import Enum, IntEnum
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import (
@@ -152,27 +152,27 @@ class PointResult:
         return self.outcome is not PointOutcome.DONE or math.isnan(self.f0_hz)
 
     @property
-    def position_m(self) -> npt.NDArray[np.float64]:
+    def position_m(self) -> FloatArray:
         """(3,) point on the surface [m]."""
         return np.array([self.x_m, self.y_m, self.z_m])
 
     @property
-    def normal(self) -> npt.NDArray[np.float64]:
+    def normal(self) -> FloatArray:
         """(3,) outward unit normal of the surface."""
         return np.array([self.normal_x, self.normal_y, self.normal_z])
 
     @property
-    def estimate(self) -> npt.NDArray[np.float64]:
+    def estimate(self) -> FloatArray:
         """(2,) f0 [Hz] and damping ratio; NaN where not estimated."""
         return np.array([self.f0_hz, self.damping_ratio])
 
     @property
-    def std(self) -> npt.NDArray[np.float64]:
+    def std(self) -> FloatArray:
         """(2,) of f0 [Hz] and damping ratio; NaN where unknown."""
         return np.array([self.f0_std_hz, self.damping_ratio_std])
 
     @property
-    def covariance(self) -> npt.NDArray[np.float64]:
+    def covariance(self) -> FloatArray:
         """(2, 2) of f0 [Hz] and damping ratio; NaN where unknown."""
         cross = self.f0_damping_covariance_hz
         return np.array([[self.f0_std_hz**2, cross], [cross, self.damping_ratio_std**2]])
@@ -229,9 +229,7 @@ def from_message(message: Any) -> PointResult:
     )
 
 
-def mode_columns(
-    estimate: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64], prefix: str = ""
-) -> dict[str, Any]:
+def mode_columns(estimate: FloatArray, covariance: FloatArray, prefix: str = "") -> dict[str, Any]:
     """Numbers of one mode, by the names of their fields in `PointResult` and `BandResult`.
 
     Parameters

@@ -13,6 +13,7 @@ from scipy.interpolate import griddata
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.adaptive import known_points
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, TiledSurface, krige_many
@@ -24,7 +25,7 @@ LOW_RGB = (64, 105, 255)
 HIGH_RGB = (255, 210, 50)
 
 
-def shares(values: npt.ArrayLike, over: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def shares(values: npt.ArrayLike, over: npt.ArrayLike) -> FloatArray:
     """(...) place of each value between the least of `over`, 0, and the largest, 1; 0 if these are equal.
 
     Values beyond them have the place of the nearer one.
@@ -34,13 +35,12 @@ def shares(values: npt.ArrayLike, over: npt.ArrayLike) -> npt.NDArray[np.float64
     return np.zeros_like(v) if span == 0 else np.clip((v - low) / span, 0.0, 1.0)
 
 
-def colours(share: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def colours(share: npt.ArrayLike) -> FloatArray:
     """(..., 3) red, green, blue from 0 to 1 for shares (...) from 0 to 1."""
     low, high = np.array(LOW_RGB) / 255, np.array(HIGH_RGB) / 255
     return np.asarray(low + np.asarray(share, float)[..., None] * (high - low))
 
 
-FloatArray = npt.NDArray[np.float64]
 SAME_PLACE_M = 1e-4
 LONE_SPACING_M = 0.005
 """What a single point is taken to be apart from others where it is drawn [m]."""

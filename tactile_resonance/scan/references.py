@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.validity import Validity, check_in_air
 from tactile_resonance.poles.result import Poles
@@ -18,7 +18,6 @@ from tactile_resonance.scan.point_result import POLES_TYPE
 from tactile_resonance.scan.run_content import RECORDING, RunContent
 from tactile_resonance.scan.scene import DriftLimits
 
-FloatArray = npt.NDArray[np.float64]
 SILENT, BEFORE, AFTER = "silent", "air-before", "air-after"
 # A difference beyond so many of its standard deviations is no noise: once in 16 000.
 _SIGNIFICANT = 4.0

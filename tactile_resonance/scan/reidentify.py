@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.fields import read_dataclass, read_yaml, section
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
@@ -238,7 +239,7 @@ def _identified(job: tuple) -> tuple[npt.NDArray, str]:
     return rows, _as_csv(rows, name_of_run)
 
 
-def _unsure(batch: PolesBatch, kind: BinsKind) -> npt.NDArray[np.bool_]:
+def _unsure(batch: PolesBatch, kind: BinsKind) -> BoolArray:
     """(n,) points whose fit shows that something is not as the model says."""
     sure = np.isin(batch.status_code, [STATUSES.index(status) for status in _SURE])
     if kind.realisations == 1:  # others have distortion, which no line has as much of as the next
@@ -286,7 +287,7 @@ def _fill_nan(rows: npt.NDArray, but: tuple[str, ...] = ()) -> None:
             rows[name] = np.nan
 
 
-def _main_first(peak: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+def _main_first(peak: FloatArray) -> IntArray:
     """(n, places) order of modes: the highest peak, then the others as they are, those without one last."""
     places = np.tile(np.arange(peak.shape[1]), (len(peak), 1))
     if peak.shape[1] == 0:

@@ -15,9 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-import numpy as np
-import numpy.typing as npt
-
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import (
     build,
@@ -262,7 +260,7 @@ class ScanScene:
 
     name: str
     force_n: float
-    positions_m: npt.NDArray[np.float64]
+    positions_m: FloatArray
     frame_id: str = "table"
     hold: Hold = Hold.FORCE
     sensor: SensorUse = field(default_factory=SensorUse)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
 
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.array_files import read_arrays
 from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import (
@@ -26,8 +27,6 @@ from tactile_resonance.fields import (
 )
 from tactile_resonance.scan.mesh import TriangleMesh, read_stl
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 MOST_SEARCH_M = 0.02
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from tactile_resonance.scan.hands import PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.plan import tip_orientation
@@ -17,7 +16,6 @@ from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.surface import TouchRequest
 from tactile_resonance.scan.touch import TouchedSurface, fit_surface
 
-FloatArray = npt.NDArray[np.float64]
 UP = (0.0, 0.0, 1.0)
 # Turns of the fit and of the normals along which the ball meets it; each leaves a hundredth of the error.
 _TURNS = 4

@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import check_above_zero, check_within, number, require
 from tactile_resonance.scan.hands import Touch
@@ -25,7 +25,6 @@ from tactile_resonance.scan.surface import TouchRequest, check_search
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, find_surface, fit_touches
 from tactile_resonance.scan.touch import TouchedSurface, fit_surface
 
-FloatArray = npt.NDArray[np.float64]
 MOST_TILT_STD_RAD = 5e-3
 """Standard deviation of the tilt about any axis; beyond it the points lie too close together or to one line."""
 

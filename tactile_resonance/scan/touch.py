@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.scan.surface import unit_normal
 
-FloatArray = npt.NDArray[np.float64]
 FORMS = {"plane": 3, "quadric": 6}
 _IMPROBABLE = 1e-3  # residuals less probable than this are no noise
 _WORST_CONDITION = 1e6
@@ -64,7 +64,7 @@ class TouchedSurface:
         basis, _, _ = self._basis(xy_m)
         return np.sqrt(np.einsum("...i,ij,...j->...", basis, self.covariance_m2, basis))
 
-    def known(self, xy_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
         """(...) in the square about the contacts: a form fitted to them need not go on beside them."""
         return np.all(np.abs(np.asarray(xy_m, float) - self.center_m) <= self.scale_m, axis=-1)
 

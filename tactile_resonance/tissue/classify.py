@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special  # scipy.stats takes a node most of a second to import
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
 
-FloatArray = npt.NDArray[np.float64]
 UNKNOWN = "unknown"
 
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.fields import require
 
-FloatArray = npt.NDArray[np.float64]
 _STARTS, _ROUNDS, _CONVERGED = 6, 1000, 1e-6
 
 
@@ -49,7 +49,7 @@ class Clusters:
     bic: FloatArray
 
     @property
-    def of_point(self) -> npt.NDArray[np.int64]:
+    def of_point(self) -> IntArray:
         """(n,) most probable group of each point."""
         return np.argmax(self.probability, axis=1)
 

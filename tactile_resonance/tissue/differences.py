@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special, stats
 
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 _ROUNDS = 50
 _CANDIDATES = 500  # among which the point in the middle of all is looked for
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import check_above_zero, check_not_negative, require
 
-FloatArray = npt.NDArray[np.float64]
 NAN = float("nan")
 _BEND = 1 / 3  # see `refer_to_nominal`
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import (
     build,
     check_above_zero,
@@ -34,8 +34,6 @@ from tactile_resonance.tissue.nominal_contact import (
     sensitivity_of_preloads,
 )
 from tactile_resonance.tissue.spread import LEVELS, SpreadSource, TissueSpread
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,11 +9,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.frf.nested import NestedMeans, nested_means
 from tactile_resonance.tissue.classify import TissueClass, predictive_class
 
-FloatArray = npt.NDArray[np.float64]
 Texts = npt.NDArray[np.str_]
 LEVELS = ("preparation", "position", "repetition")
 """Sources of spread, outermost first: figure 9 of arXiv 1805.00682, without its periods."""
@@ -57,7 +57,7 @@ class ReferencePoints:
             )
             require(good, item.name, array.shape, f"shape {shape}, finite")
 
-    def where(self, chosen: npt.NDArray[np.bool_]) -> ReferencePoints:
+    def where(self, chosen: BoolArray) -> ReferencePoints:
         """Those chosen."""
         return ReferencePoints(*(getattr(self, item.name)[chosen] for item in fields(self)))
 

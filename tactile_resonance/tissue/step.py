@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 from scipy import special
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.tissue.spread import TissueSpread
 
-FloatArray = npt.NDArray[np.float64]
 _PERCENT = re.compile(r"(\d+(?:\.\d+)?)\s*%")
 # A correlation beyond is not relied on: what is left across it is rounding and chance.
 _LEAST_EIGENVALUE = 1e-4

@@ -8,14 +8,13 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, posteriors
 from tactile_resonance.tissue.spread import ReferencePoints, Texts, spreads_of
 
-FloatArray = npt.NDArray[np.float64]
 EDGES = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.99, 1.0)
 """Of the bins of stated probability in a reliability diagram."""
 
@@ -44,17 +43,17 @@ class Trial:
 
     tissue: Texts
     called: Texts
-    known: npt.NDArray[np.bool_]
+    known: BoolArray
     probability: FloatArray
     likely: Texts
     tail: FloatArray
     preparation: Texts
 
-    def where(self, chosen: npt.NDArray[np.bool_]) -> Trial:
+    def where(self, chosen: BoolArray) -> Trial:
         """Those points alone."""
         return Trial(*(getattr(self, item.name)[chosen] for item in fields(self)))
 
-    def share(self, which: npt.NDArray[np.bool_]) -> Share:
+    def share(self, which: BoolArray) -> Share:
         """How many of the points are `which` (n,)."""
         groups = np.unique(self.preparation).size
         return Share(int(np.sum(which)), len(which), groups)

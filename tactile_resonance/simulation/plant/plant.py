@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import GRAVITY_M_S2
 from tactile_resonance.contact.samples import Pose
@@ -34,8 +34,6 @@ from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMot
 from tactile_resonance.simulation.plant.tip import TipOnTissue
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.ur5e.poses import IDENTITY, ORIGIN, Transform, beside
-
-FloatArray = NDArray[np.float64]
 
 NEAR_M = 0.005
 """Below this height the tip is stepped on its tissue: a beam that swings before it touches."""

@@ -9,12 +9,10 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Vector, difference, dot, vector
 from tactile_resonance.fields import check_not_negative, check_within, require
-
-FloatArray = NDArray[np.float64]
 
 
 class PlantSurface(Protocol):

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from itertools import takewhile
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Vector
@@ -114,8 +114,6 @@ class PlantHistory:
         """Steps after a time, oldest first."""
         return list(takewhile(lambda step: step.time_s > after_s, reversed(self._steps)))[::-1]
 
-
-FloatArray = NDArray[np.float64]
 
 TIP_IN_FLANGE = Pose(np.array([0.0, 0.0, 0.12]), np.array([0.0, math.pi, 0.0]))
 """Where the tip sits: 0.12 m before the flange, its z against the flange's."""

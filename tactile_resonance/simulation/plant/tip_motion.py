@@ -7,13 +7,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.ur5e.tracking import Jitter, Lag, TrackingParameters
-
-FloatArray = NDArray[np.float64]
 
 ROTATION_LEVER_M = 0.1
 """Lever that turns the acceleration limit [m/s2] into one of rotation [rad/s2]."""

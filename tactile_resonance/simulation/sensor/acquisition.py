@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.record import Channel
-from tactile_resonance.simulation.sensor.linear import FloatArray
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.cantilever import cantilever_eigenvalues, tip_shape
 from tactile_resonance.sensor import (
     BeamParameters,
@@ -22,8 +22,6 @@ from tactile_resonance.sensor import (
 )
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.sensor.acquisition import BenchEffects, SignalParts, convert
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, couple
-from tactile_resonance.simulation.sensor.linear import (
-    FloatArray,
-    Lines,
-    PoleResidueModel,
-)
+from tactile_resonance.simulation.sensor.linear import Lines, PoleResidueModel
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
 from tactile_resonance.simulation.sensor.response import ResponseStream, VaryingStream, steady_state
 from tactile_resonance.simulation.tissue.hertz import HertzParameters, Tissue, hertz_contact

@@ -19,10 +19,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.sensor.beam import BeamModes, sensor_modes
-from tactile_resonance.simulation.sensor.linear import ComplexArray, FloatArray, PoleResidueModel
+from tactile_resonance.simulation.sensor.linear import PoleResidueModel
 from tactile_resonance.simulation.tissue.hertz import HertzContact
 
 

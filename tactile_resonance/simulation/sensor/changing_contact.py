@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, couple
-from tactile_resonance.simulation.sensor.linear import ComplexArray, FloatArray
 from tactile_resonance.simulation.tissue.hertz import (
     HertzContact,
     HertzParameters,

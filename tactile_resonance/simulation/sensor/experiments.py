@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.fields import require
 from tactile_resonance.multisine import Grid, design_multisine
 from tactile_resonance.simulation.sensor.acquisition import BenchEffects
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.linear import FloatArray
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import PhantomScene
 
@@ -37,7 +37,7 @@ def records_at_levels(
     periods: int = 3,
     seed: int = 1,
     progress: Progress = lambda text: None,
-) -> dict[float, tuple[FloatArray, FloatArray, NDArray[np.int64], float]]:
+) -> dict[float, tuple[FloatArray, FloatArray, IntArray, float]]:
     """Records of an odd random multisine at several drive levels, nonlinearity switched on.
 
     Returns
@@ -76,7 +76,7 @@ def repeated_records(
     gelatine_percent: float = 12.0,
     seed: int = 1,
     progress: Progress = lambda text: None,
-) -> tuple[FloatArray, FloatArray, NDArray[np.int64], float]:
+) -> tuple[FloatArray, FloatArray, IntArray, float]:
     """Records of the same excitation on several preparations, positions and repetitions.
 
     Returns

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.calibration.model import SensorModel
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.sensor import SensorParameters
@@ -16,7 +16,7 @@ from tactile_resonance.simulation.sensor.acquisition import BenchEffects
 from tactile_resonance.simulation.sensor.bench import DEFAULT_EFFECTS, BenchRun, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import couple
 from tactile_resonance.simulation.sensor.experiments import Progress
-from tactile_resonance.simulation.sensor.linear import FloatArray, PoleResidueModel
+from tactile_resonance.simulation.sensor.linear import PoleResidueModel
 from tactile_resonance.simulation.tissue.hertz import HertzContact, Tissue
 
 SPREAD = 0.03
@@ -67,7 +67,7 @@ def records_of_calibration(
     seed: int = 1,
     effects: BenchEffects = DEFAULT_EFFECTS,
     progress: Progress = lambda text: None,
-) -> tuple[list[tuple[str, float, FloatArray, FloatArray]], NDArray[np.int64], float]:
+) -> tuple[list[tuple[str, float, FloatArray, FloatArray]], IntArray, float]:
     """Records in air, with masses and springs at the tip, and of a loop-back, in the steady state.
 
     Lines of 0.5 Hz up to 1 kHz, of 2 Hz up to 12 kHz, above the highest of ten modes; 1 V rms; the first

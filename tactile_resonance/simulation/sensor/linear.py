@@ -12,13 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import require
 from tactile_resonance.multisine import Excitation
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class Lines:
     ``u(t) = Re sum_k phasor_v[k] exp(j 2 pi f_k t)``.
     """
 
-    harmonics: NDArray[np.int64]
+    harmonics: IntArray
     phasor_v: ComplexArray
     sample_rate_hz: float
     samples_per_period: int

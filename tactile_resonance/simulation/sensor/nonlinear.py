@@ -15,15 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.fft
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.sensor import NonlinearParameters
-from tactile_resonance.simulation.sensor.linear import (
-    ComplexArray,
-    FloatArray,
-    Lines,
-    PoleResidueModel,
-    sample_period,
-)
+from tactile_resonance.simulation.sensor.linear import Lines, PoleResidueModel, sample_period
 from tactile_resonance.simulation.sensor.response import ResponseStream
 
 

@@ -19,15 +19,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
-from tactile_resonance.simulation.sensor.linear import (
-    ComplexArray,
-    FloatArray,
-    Lines,
-    PoleResidueModel,
-    sample_period,
-)
+from tactile_resonance.simulation.sensor.linear import Lines, PoleResidueModel, sample_period
 
 # A decay this far below the response is not computed: below the rounding of the sum it enters.
 NEGLIGIBLE = 1e-18

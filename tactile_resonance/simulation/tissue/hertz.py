@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import check_above_zero, check_within, require
-from tactile_resonance.mechanics.prony import ComplexArray, FloatArray, Prony
+from tactile_resonance.mechanics.prony import Prony
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,9 @@ from typing import Protocol
 
 import numpy as np
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.tissue.hertz import FloatArray, Tissue
+from tactile_resonance.simulation.tissue.hertz import Tissue
 
 Values = list[float]  # one per Prony term: its share E_j v_j of the line load
 Node = tuple[float, float, FloatArray]  # x, time when it was let go, modal state then

@@ -15,6 +15,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import (
@@ -25,7 +26,6 @@ from tactile_resonance.fields import (
     read_file,
     require,
 )
-from tactile_resonance.simulation.sensor.linear import FloatArray
 from tactile_resonance.simulation.tissue.hertz import HertzParameters, Tissue
 from tactile_resonance.simulation.tissue.shapes import Point
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import build, check_above_zero, read_dataclass, read_yaml, require
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
-from tactile_resonance.simulation.sensor.linear import FloatArray
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import (
     FillingEntry,
@@ -89,7 +89,7 @@ class PhantomScene:
     tip_radius_m: float = 2.5e-3
     poisson_ratio: float = 0.49
 
-    def region_index(self, position_m: ArrayLike) -> NDArray[np.int64]:
+    def region_index(self, position_m: ArrayLike) -> IntArray:
         """Return the index of the region at positions (..., 2 or 3) [m], -1 where there is none."""
         position = np.asarray(position_m, dtype=float)
         good = position.ndim >= 1 and position.shape[-1] in (2, 3)

@@ -14,11 +14,11 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import check_above_zero, require
-from tactile_resonance.simulation.sensor.linear import FloatArray
 
 Point = tuple[float, ...]
 
@@ -26,7 +26,7 @@ Point = tuple[float, ...]
 class Shape(Protocol):
     """A region of space."""
 
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell for positions (..., 2 or 3) [m] which lie inside, shape (...)."""
         ...
 
@@ -41,7 +41,7 @@ class Disc:
     def __post_init__(self) -> None:
         check_above_zero(self, "radius_m")
 
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie inside or on the edge."""
         distance = np.linalg.norm(position_m[..., :2] - np.asarray(self.center_m), axis=-1)
         return np.asarray(distance <= self.radius_m)
@@ -60,7 +60,7 @@ class Box:
         above = len(high) == len(low) and all(a < b for a, b in zip(low, high, strict=True))
         require(above, "high_m", high, f"above low_m = {low} in every coordinate")
 
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie inside or on the faces."""
         position = _coordinates(position_m, len(self.low_m))
         inside = (position >= np.asarray(self.low_m)) & (position <= np.asarray(self.high_m))
@@ -79,7 +79,7 @@ class HalfSpace:
         good = len(self.normal) == len(self.point_m) and any(self.normal)
         require(good, "normal", self.normal, "a vector other than 0, of as many coordinates")
 
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie on the side the normal points away from."""
         position = _coordinates(position_m, len(self.normal))
         return np.asarray((position - np.asarray(self.point_m)) @ np.asarray(self.normal) <= 0)
@@ -95,14 +95,14 @@ class Sphere:
     def __post_init__(self) -> None:
         check_above_zero(self, "radius_m")
 
-    def contains(self, position_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie inside or on the surface."""
         position = _coordinates(position_m, 3)
         way = position - np.asarray(self.center_m)
         return np.asarray(np.einsum("...i,...i", way, way) <= self.radius_m**2)
 
 
-def _coordinates(position_m: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _coordinates(position_m: FloatArray, count: int) -> FloatArray:
     """Cut off the height, or add height 0, so that the last axis has `count` coordinates."""
     missing = count - position_m.shape[-1]
     if missing <= 0:

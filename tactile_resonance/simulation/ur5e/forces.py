@@ -7,14 +7,12 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Turn, Vector, cross, rotated, rotated_back
 from tactile_resonance.simulation.noise import NormalRows
 from tactile_resonance.simulation.ur5e.poses import ORIGIN, ZERO, Six, Transform, beside, difference
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
-
-FloatArray = NDArray[np.float64]
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import NO_TURN, Vector, cross, dot, rotated_back
 from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.ur5e.forces import (
@@ -100,8 +100,6 @@ class Joints:
         self._slower = self.qd = ZERO
         return self.q
 
-
-FloatArray = NDArray[np.float64]
 
 # Cycles for which joint positions are remembered: one second.
 HISTORY = 500

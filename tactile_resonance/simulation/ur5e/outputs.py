@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Vector, rotated_back
 from tactile_resonance.simulation.ur5e.forces import ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
@@ -28,7 +28,6 @@ from tactile_resonance.simulation.ur5e.safety import RobotMode
 if TYPE_CHECKING:
     from tactile_resonance.simulation.ur5e.controller import UrController
 
-FloatArray = NDArray[np.float64]
 
 LINK_MASS_KG = np.array([3.761, 8.058, 2.846, 1.37, 1.3, 0.365])
 # In the frames of the links 1 to 6.

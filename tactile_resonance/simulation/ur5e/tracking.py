@@ -9,12 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.noise import NormalRows, Seed
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
