@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes as real processes in a domain of their own, on loopback."""
 
+import contextlib
+import socket
 import sys
 from pathlib import Path
 
@@ -10,26 +12,37 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 
-def _fresh_domain(patch):
+@contextlib.contextmanager
+def _fresh_domain():
+    """Environment of a domain that nobody else takes meanwhile: the port of its last participant is held."""
     from tactile_resonance.processes import free_domain_id
 
-    number = free_domain_id({})
-    patch.setenv("ROS_DOMAIN_ID", str(number))
-    patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    return number
+    patching, holding = pytest.MonkeyPatch.context(), socket.socket(type=socket.SOCK_DGRAM)
+    with patching as patch, holding as held:
+        number = None
+        while number is None:
+            number = free_domain_id({})
+            try:
+                held.bind(("127.0.0.1", 7400 + 250 * (number + 1) - 2))
+            except OSError:  # tests that run beside these were faster
+                number = None
+        patch.setenv("ROS_DOMAIN_ID", str(number))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield number
 
 
 @pytest.fixture
-def domain(monkeypatch):
+def domain():
     """Environment of a fresh domain; processes started from here inherit it."""
-    return _fresh_domain(monkeypatch)
+    with _fresh_domain() as number:
+        yield number
 
 
 @pytest.fixture(scope="module")
 def module_domain():
     """The same for nodes that the tests of one file share: starting them takes longer than most tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        yield _fresh_domain(patch)
+    with _fresh_domain() as number:
+        yield number
 
 
 @pytest.fixture(scope="session")
@@ -39,9 +52,8 @@ def demonstration(tmp_path_factory):
     sys.path.insert(0, str(Path(__file__).parent))
     from demonstrated import undisturbed
 
-    with pytest.MonkeyPatch.context() as patch:
-        domain = _fresh_domain(patch)
-        return undisturbed(tmp_path_factory.mktemp("demonstration"), domain)
+    with _fresh_domain() as number:
+        return undisturbed(tmp_path_factory.mktemp("demonstration"), number)
 
 
 @pytest.fixture(scope="module")
