@@ -143,6 +143,7 @@ def demonstrate(
 
     def prepare() -> None:
         end_with_parent()
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background job inherits it ignored
         os.sched_setaffinity(0, cores)
         if load.without_priority:
             ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
