@@ -316,7 +316,6 @@ class ContactNode(ManagedNode):
         if thread is None:
             return
         self._topics.say_again()
-        self._forces.look()
         if self._goal is not None:
             controller = thread.controller
             kind = MakeContact if self._test is None else Indent
@@ -340,7 +339,7 @@ class ContactNode(ManagedNode):
             self.fail(f"{self._fault}; reconnecting")
             return
         goal, controller = self._goal, thread.controller
-        if goal is None and controller.state is State.IDLE and not thread.clock.simulated:
+        if goal is None and not thread.clock.simulated:
             self._teller.cancel()  # each call wakes the executor, and the loop tells what changes
         elif self._teller.is_canceled():
             self._teller.reset()

@@ -20,6 +20,8 @@ from tactile_resonance.srv import ForceOver
 
 WAIT_S = 0.2
 """An answer waits so long for the loop to come to the end of its block, on the machine's clock [s]."""
+LOOK_EVERY_S = 0.1
+"""While answers wait it is looked so often whether one has waited too long [s]."""
 
 
 class ForceService:
@@ -50,8 +52,10 @@ class ForceService:
         self._state, self._bias_n = State.IDLE, (0.0, 0.0, 0.0)
         self._now_ns, self._awaited_ns = 0, math.inf
         self._waiting: list[tuple[int, float, Future]] = []  # end [ns], deadline [s]
-        self._guard = node.create_guard_condition(self.look)
+        self._guard = node.create_guard_condition(self._look)
         node.resources.callback(node.destroy_guard_condition, self._guard)
+        self._timer = node.every(LOOK_EVERY_S, self._look)
+        self._timer.cancel()
         node.serve(ForceOver, "force_over", self._on_request)
 
     def take(self, cycle: Cycle) -> None:
@@ -66,7 +70,7 @@ class ForceService:
             self._awaited_ns = math.inf
             self._guard.trigger()
 
-    def look(self) -> None:
+    def _look(self) -> None:
         """Answer requests whose block is over by now, and those that have waited too long."""
         now_s = time.monotonic()
         for entry in list(self._waiting):
@@ -75,6 +79,8 @@ class ForceService:
                 self._waiting.remove(entry)
                 future.set_result(None)
         self._awaited_ns = min((end_ns for end_ns, _, _ in self._waiting), default=math.inf)
+        if not self._waiting:
+            self._timer.cancel()
 
     async def _on_request(
         self, request: ForceOver.Request, response: ForceOver.Response
@@ -95,7 +101,8 @@ class ForceService:
             future: Future = Future()
             self._waiting.append((end_ns, time.monotonic() + WAIT_S, future))
             self._awaited_ns = min(self._awaited_ns, end_ns)
-            self.look()  # the loop may have come there meanwhile
+            self._timer.reset()
+            self._look()  # the loop may have come there meanwhile
             await future
         over = self._record.over(start_ns, end_ns)
         response.force_n, response.force_std_n = over.force_n, over.force_std_n

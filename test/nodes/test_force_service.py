@@ -48,7 +48,6 @@ class Contact(ManagedNode):
 
     def _tick(self):
         self.ticks += 1
-        self.forces.look()
 
     def run(self, until_ms, state=State.HOLD, began_ms=0, fault=None, silent_ms=(0, 0)):
         """Let the loop see a force that rises from 0 at the beginning, less what the cell left out."""
@@ -180,7 +179,7 @@ def test_a_loop_that_stands_is_not_waited_for_for_long(served, monkeypatch):
     served.wait(lambda: served.node.forces._waiting)
     told.now_s += 0.19
     ticks = served.node.ticks
-    served.wait(lambda: served.node.ticks > ticks + 3)
+    served.wait(lambda: served.node.ticks > ticks + 50)
     assert not asked.done()
     told.now_s += 0.02
     served.wait(asked.done)
