@@ -12,6 +12,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from itertools import takewhile
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +40,7 @@ MOST_STEPS = 250
 """In one answer: to write more would hold the plant up."""
 
 
-@dataclass(frozen=True, slots=True)
-class _PlantStep:
+class _PlantStep(NamedTuple):
     time_s: float
     tip_m: Vector
     normal_force_n: float

@@ -205,13 +205,17 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
 }
 
 
-def _register(kind: str, number: int) -> Reader:
-    return lambda o: getattr(o.robot.registers, f"output_{kind}")[number]
+def _integer(number: int) -> Reader:
+    return lambda o: o.robot.registers.output_int[number]
+
+
+def _double(number: int) -> Reader:
+    return lambda o: o.robot.registers.output_double[number]
 
 
 for _number in range(REGISTER_COUNT):
-    _OUTPUTS[f"output_int_register_{_number}"] = ("INT32", _register("int", _number))
-    _OUTPUTS[f"output_double_register_{_number}"] = ("DOUBLE", _register("double", _number))
+    _OUTPUTS[f"output_int_register_{_number}"] = ("INT32", _integer(_number))
+    _OUTPUTS[f"output_double_register_{_number}"] = ("DOUBLE", _double(_number))
 
 # RTDE types of all outputs, and what reads them, by name.
 OUTPUT_TYPES: dict[str, str] = {name: kind for name, (kind, _) in _OUTPUTS.items()}
