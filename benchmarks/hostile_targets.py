@@ -4,14 +4,9 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
-import os
-import select
 import shutil
-import socket
 import struct
-import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -20,39 +15,44 @@ from pathlib import Path
 import numpy as np
 import scipy.io
 
-from benchmarks.endurance import content
-from benchmarks.skip_hands import VirtualHands
+from benchmarks.hostile_run import BAND_HZ, make_run
 from tactile_resonance.array_files import read_arrays
 from tactile_resonance.bringup import read_parameter_file
+from tactile_resonance.calibration.calibration import Calibration
+from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
+from tactile_resonance.calibration.model import SensorModel
 from tactile_resonance.commands.analyze import parse_harmonics, parse_order, parse_segments
+from tactile_resonance.commands.mechanics import COLUMNS
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.drivers.can_frames import Assembler, read_can_description
+from tactile_resonance.drivers.can_frames import read_can_description
 from tactile_resonance.drivers.force_config import read_force_config
 from tactile_resonance.drivers.nidaq_config import read_nidaq_config
-from tactile_resonance.drivers.rtde_stream import PORT, RtdeStream
 from tactile_resonance.drivers.twist import read_twist_config
 from tactile_resonance.drivers.ur_config import read_ur_config
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.record import Channel, Record
+from tactile_resonance.recording.files import read_recording
 from tactile_resonance.recording.stored_file import read_stored, write_stored
+from tactile_resonance.scan.kept_bins import NAME, kept_bins
+from tactile_resonance.scan.labels import read_labels
 from tactile_resonance.scan.mesh import read_stl
 from tactile_resonance.scan.notes import parse_notes
-from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.point_file import read_content, read_messages
-from tactile_resonance.scan.progress import Controls
+from tactile_resonance.scan.point_file import read_content
+from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.scan.table_file import read_table
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
-from tactile_resonance.strict_yaml import dump_yaml, parse_yaml
-from tactile_resonance.tissue.references import read_classes
+from tactile_resonance.strict_yaml import parse_yaml
+from tactile_resonance.tissue.references import read_classes, read_sources
 
 Read = Callable[[bytes], object]
+WITHIN_S, PROCESS_WITHIN_S = 5.0, 60.0
+"""Of an answer; of one by a process of its own, for whose start a busy machine takes long."""
 TABLE = b"""format: tactile_resonance table 1
 base_frame: base
 table_in_base: [0.3, 0.0, 0.1, 0.0, 0.0, 0.0]
@@ -71,7 +71,11 @@ CONFIGURATION: dict[str, Callable[[Path], object]] = {
     "tissues.yaml": read_tissues,
 }
 """Readers of the files in config/, by pattern."""
-WANTED = ("u", "y", "sample_rate_hz", "samples_per_period")
+LIBRARY = b"""spread:
+  gel10:
+    preparation: {f0_std_hz: 1.0, damping_ratio_std: 0.001, degrees_of_freedom: 4, holds: [position]}
+    repetition: {f0_std_hz: 0.5, damping_ratio_std: 0.001, correlation: 0.1, degrees_of_freedom: 9}
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,28 +91,31 @@ class Target:
         Takes bytes; returns, or raises what it may raise.
     share : float
         Of all inputs.
+    within_s : float
+        In which it answers [s].
     """
 
     name: str
     seeds: list[bytes]
     read: Read
     share: float
+    within_s: float = WITHIN_S
 
 
 def targets(folder: Path) -> list[Target]:
     """All readers; files are written into a folder."""
-    run = _recorded(folder / "run")
+    run = make_run(folder / "run")
     return [
         Target("YAML text", [path.read_bytes() for path in _config("**/*.yaml")], _yaml, 0.25),
         *_configuration(folder),
         *_arrays(folder),
         *_of_run(folder, run),
-        Target("STL surface", _stl(), _file(folder / "surface.stl", read_stl), 0.06),
+        Target("calibration", [_calibration()], _file(folder / "calibration.yaml", read_calibration), 0.01),
+        Target("STL surface", _stl(), _file(folder / "surface.stl", read_stl), 0.02),
         Target("stored record", [_stored(folder)], _file(folder / "r.npz", partial(read_stored, kind=Record)),
                0.03),
         Target("options of analyze", [b"3,10:20:5", b"0:10,20:30", b"auto", b"4"], _options, 0.15),
         Target("notes of a run", [b"{temperature_c: 21.5, tip_wetness: wet}"], _notes, 0.08),
-        *_wire(),
     ]  # fmt: skip
 
 
@@ -150,6 +157,7 @@ def _configuration(folder: Path) -> Iterable[Target]:
     scene = (share_path("config/scenes") / "two_gelatines.yaml").read_bytes()
     yield Target("tissue classes", [scene], _file(folder / "classes.yaml", read_classes), 0.01)
     yield Target("table", [TABLE], _file(folder / "table.yaml", lambda path: read_table(path, "base")), 0.01)
+    yield Target("sources of spread", [LIBRARY], _file(folder / "library.yaml", read_sources), 0.005)
 
 
 def _arrays(folder: Path) -> Iterable[Target]:
@@ -165,24 +173,36 @@ def _arrays(folder: Path) -> Iterable[Target]:
     np.savez_compressed(packed, **arrays)
     scipy.io.savemat(mat, arrays)
     csv = "u,y\n" + "\n".join(f"{a:.6g},{b:.6g}" for a, b in zip(arrays["u"], arrays["y"], strict=True))
-    for suffix, seeds, share in (
+    known = {"csv": {"sample_rate_hz": 100.0, "samples_per_period": 8}}
+    for suffix, seeds, *share in (
         ("npz", [npz.getvalue(), packed.getvalue()], 0.05),
         ("csv", [csv.encode(), csv.replace(",", ";").encode()], 0.05),
-        ("mat", [mat.getvalue()], 0.0002),  # each in a process of its own
+        ("mat", [mat.getvalue()], 0.0002, PROCESS_WITHIN_S),
     ):
-        read = _file(folder / f"record.{suffix}", lambda path: read_arrays(path, WANTED))
-        yield Target(f"arrays of .{suffix}", seeds, read, share)
+        read = partial(read_recording, **known.get(suffix, {}))
+        yield Target(f"record of .{suffix}", seeds, _file(folder / f"record.{suffix}", read), *share)
+    test = "time_s,force_n,indentation_m\n" + "\n".join(f"{k},{0.01 * k},{1e-5 * k}" for k in range(24))
+    read_test = _file(folder / "test.csv", _mechanical_test)
+    yield Target("mechanical test", [test.encode()], read_test, 0.02)
 
 
-def _recorded(run: Path) -> Path:
-    """A small run."""
-    scene = run.with_name("scene.yaml")
-    text = dump_yaml(content(4))
-    scene.write_text(text)
-    plan, hands = make_plan(read_scan_scene(scene)), VirtualHands(read_scene(read_tissues(), scene), 1.2)
-    with RunDirectory.create(run, text, plan.points, {"seed": 1}) as made:
-        ScanRunner(plan, made, hands, Controls(), lambda progress: None, 1, lambda done: None).run()
-    return run
+def _mechanical_test(path: Path) -> None:
+    arrays, _ = read_arrays(path, COLUMNS)
+    if set(arrays) == set(COLUMNS):
+        in_order = (arrays[name].ravel().astype(float) for name in COLUMNS)
+        IndentationRecord(Protocol.RELAXATION, *in_order, BallTip(0.0025))
+
+
+def _calibration() -> bytes:
+    """Of a sensor of two modes."""
+    model = SensorModel(
+        *(np.array(of) for of in ([2e3, 1e4], [0.01, 0.02], [30.0, 50.0], [90.0, -70.0])),
+        *map(np.asarray, (0.1, 1.0, 2.0, 1e-5)),
+    )
+    size = model.values.size
+    covariance = np.diag(1e-8 * np.arange(1.0, size + 1))
+    made = Calibration(model, covariance, np.ones(size, bool), (100.0, 900.0), 1e-6, 1.0)
+    return CalibratedSensor(made, 0.0025, 8e-5, 1e-7, {"sensor": "a"}).as_text().encode()
 
 
 def _of_run(folder: Path, run: Path) -> Iterable[Target]:
@@ -190,17 +210,27 @@ def _of_run(folder: Path, run: Path) -> Iterable[Target]:
 
     def point_file(path: Path) -> None:
         read_content(path)
-        for _ in read_messages(path, "poles"):
+        for _ in measurements_of_file(path):
             pass
 
-    yield Target("recording of a point", [point.read_bytes()], _file(folder / "p.mcap", point_file), 0.008)
-    for name in ("run.json", "index.jsonl", "results.csv", "scene.yaml"):
-        if not (run / name).exists():
-            continue
-        own = folder / f"run of {name}"
-        shutil.copytree(run, own)
-        read = _file(own / name, lambda _, own=own: read_run(own))
-        yield Target(f"{name} of a run", [(run / name).read_bytes()], read, 0.006)
+    yield Target("recording of a point", [point.read_bytes()], _file(folder / "p.mcap", point_file), 0.02)
+
+    def bins_file(path: Path) -> None:
+        kept = kept_bins(path.parent, BAND_HZ)
+        for kind, rows in kept.kinds if kept else ():
+            for row in rows.read(0, min(rows.count, 8)):
+                kind.bins(row)
+
+    readers = dict.fromkeys(("run.json", "index.jsonl", "scene.yaml"), read_run)
+    for name, of_folder in readers.items():
+        own = shutil.copytree(run, folder / f"run of {name}")
+        read = _file(own / name, lambda _, own=own, of_folder=of_folder: of_folder(own))
+        yield Target(f"{name} of a run", [(run / name).read_bytes()], read, 0.005)
+    own = shutil.copytree(run, folder / "run of bins")
+    yield Target("kept bins of a run", [(run / NAME).read_bytes()], _file(own / NAME, bins_file), 0.01)
+    content = read_run(run)
+    read = _file(folder / "labels.csv", lambda path: read_labels(path, [content]))
+    yield Target("labels of points", [b"tissue,index\ngel10,0\ngel12,1\n"], read, 0.01)
 
 
 def _stl() -> list[bytes]:
@@ -224,63 +254,3 @@ def _options(data: bytes) -> None:
         except argparse.ArgumentTypeError as error:
             if "\n" in str(error).replace(repr(_text(data)), ""):
                 raise
-
-
-def _wire() -> Iterable[Target]:
-    description = read_can_description(_config("force/frames/*.yaml")[0])
-    assembler = Assembler((1, 2), 5e-4)
-
-    def frames(data: bytes) -> None:
-        for k in range(0, len(data) - 1, 9):
-            joined = assembler.add(data[k] % 3, data[k + 1 : k + 9], 1e-3 * data[k])
-            if joined:
-                description.decode(joined)
-        description.decode(data)
-
-    yield Target("CAN frames", [bytes(range(18)), b"\x0b" + bytes(15), bytes(36)], frames, 0.2)
-    yield Target("states of a robot", [_state(), _state() * 3], _Robot().read, 0.002)
-
-
-class _Robot:
-    """Answers the driver's requests as a robot does, then sends it what it is given, and closes.
-
-    A robot of 127.0.0.0/8 that nobody else simulates.
-    """
-
-    ANSWERS = {b"V": b"\1", b"S": b"\1"}
-    TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,UINT32,UINT32,INT32,INT32"
-
-    def __init__(self) -> None:
-        self._host = f"127.0.{os.getpid() % 200 + 20}.{os.getpid() // 200 % 250 + 2}"
-        self._listener = socket.create_server((self._host, PORT))
-        self._data = b""
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def read(self, data: bytes) -> None:
-        """Let a driver read it."""
-        self._data = data
-        stream = RtdeStream(self._host, 500.0)
-        try:
-            for _ in range(3):
-                select.select([stream], [], [], 0.02)
-                stream.read()
-        finally:
-            stream.close()
-
-    def _serve(self) -> None:
-        while True:
-            with self._listener.accept()[0] as channel, contextlib.suppress(OSError):
-                while head := channel.recv(3, socket.MSG_WAITALL):
-                    size, kind = struct.unpack(">Hc", head)
-                    channel.recv(size - 3, socket.MSG_WAITALL)
-                    answer = self.ANSWERS.get(kind, b"\1" + self.TYPES)
-                    channel.sendall(struct.pack(">Hc", 3 + len(answer), kind) + answer)
-                    if kind == b"S":
-                        channel.sendall(self._data)
-                        break
-
-
-def _state() -> bytes:
-    """A data package of the recipe that the driver asks for: all of it zero."""
-    payload = bytes(1 + 8 * 19 + 4 * 4)
-    return struct.pack(">Hc", 3 + len(payload), b"U") + payload

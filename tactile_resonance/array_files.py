@@ -34,7 +34,8 @@ import sys
 import numpy as np, scipy.io
 try:
     import resource
-    resource.setrlimit(resource.RLIMIT_AS, (1 << 34, 1 << 34))
+    most, of = 1 << 34, resource.RLIMIT_AS
+    resource.setrlimit(of, tuple(most if at < 0 else min(at, most) for at in resource.getrlimit(of)))
 except ImportError:  # not on Windows
     pass
 path, target, *wanted = sys.argv[1:]

@@ -3,6 +3,8 @@
 
 import io
 import os
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -87,3 +89,18 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path, data, suffix):
         arrays, refused = {}, str(error)
     assert refused == "" or (refused.startswith(path.name) and len(refused.splitlines()) == 1)
     assert all(array.dtype.kind in "biufc" for array in arrays.values())
+
+
+def test_a_mat_file_is_read_where_memory_is_limited_already(tmp_path):
+    pytest.importorskip("resource")
+    scipy.io.savemat(tmp_path / "a.mat", {"u": np.arange(3)})
+    code = (
+        "import resource, sys; from pathlib import Path\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (1 << 33, 1 << 33))\n"
+        "from tactile_resonance.array_files import read_arrays\n"
+        "print(read_arrays(Path(sys.argv[1]), ('u',))[1])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "a.mat"], capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "['u']\n", done.stderr
