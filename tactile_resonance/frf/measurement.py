@@ -79,8 +79,8 @@ class MeasurementFrf:
         """FRF with the next record, played as `excitation`.
 
         A gap in the block indices is noted; what follows it in that realisation is not used, because
-        the periods would no longer be consecutive. A realisation under way counts once it has as many
-        periods as the ones before.
+        the periods would no longer be consecutive. A block that comes twice is used once. A realisation
+        under way counts once it has as many periods as the ones before.
 
         Raises
         ------
@@ -95,6 +95,8 @@ class MeasurementFrf:
                 f"record: {u.size} and {y.size} samples, expected whole periods of {n} on both "
                 "channels"
             )
+        if record.block_index * (u.size // n) < self._periods.get(record.realisation, 0):
+            return self.frf()  # it came twice
         if excitation.level_v == 0:
             self._remember(record)
             self._note("nothing was played")

@@ -22,6 +22,8 @@ GRIDS = {
     Measure.Goal.GRID_ODD_RANDOM: Grid.ODD_RANDOM,
 }
 
+NO_RECORDS = "record_folder: "
+"""A measurement whose message begins so failed because records cannot be written."""
 MOST_REALISATIONS = 1000  # each is designed, with all its lines, before the first is played
 
 PARAMETERS = (

@@ -259,7 +259,7 @@ class ExcitationNode(ManagedNode):
 
 def _reason(error: Exception) -> str:
     # devices raise DeviceError: what the operating system refused has to do with the records
-    return f"record_folder: {error}" if isinstance(error, OSError) else str(error)
+    return f"{excitation_design.NO_RECORDS}{error}" if isinstance(error, OSError) else str(error)
 
 
 def main() -> None:

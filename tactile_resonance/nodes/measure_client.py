@@ -18,13 +18,17 @@ from rclpy.serialization import deserialize_message
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.nodes.excitation_design import GRIDS
+from tactile_resonance.nodes.excitation_design import GRIDS, NO_RECORDS
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.recording.messages import distortion_from_message, write_bands
-from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed
+from tactile_resonance.recording.messages import (
+    distortion_from_message,
+    time_from_message,
+    write_bands,
+)
+from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed, ScanEnded
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.point_file import offered_qos
 from tactile_resonance.scan.run_directory import PointRecording
@@ -147,6 +151,8 @@ class MeasureClient:
             if result.outcome != Measure.Result.NOT_READY or time.monotonic() > deadline:
                 break
             time.sleep(NOT_READY_POLL_S)
+        if result.message.startswith(NO_RECORDS):  # nor would any other point be measured
+            raise ScanEnded(f"measurement: {result.message}; the run can be resumed")
         if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
             raise PointDisturbed(f"measurement: {result.message}", "measurement failed")
         self._wait_for_results(result, check, poll)
@@ -219,6 +225,7 @@ class ScanRecorder:
         self._counts: Counter[str] = Counter()
         self._played: set[int] = set()  # excitation ids of the records that came
         self._described: set[int] = set()  # and of the excitations
+        self._blocks: set[tuple[str, int, int]] = set()  # topic, excitation id, stamp [ns]
         for topic, recorded in TOPICS.items():
             self._listen(node, topic, recorded)
 
@@ -226,7 +233,7 @@ class ScanRecorder:
         """Write what comes from now on there; of measurements only this one."""
         with self._lock:
             self._recording, self._measurement_id = recording, measurement_id
-            for kept in (self._counts, self._played, self._described):
+            for kept in (self._counts, self._played, self._described, self._blocks):
                 kept.clear()
             self.force_reason, self.distortion = "", ()
             while not self.poles.empty():
@@ -268,6 +275,12 @@ class ScanRecorder:
                     message = deserialize_message(cdr, recorded.kind)
                     if message.measurement_id != self._measurement_id:
                         return
+                if recorded.each_block:
+                    stamp_ns = time_from_message(message.header.stamp)
+                    block = topic, message.excitation_id, stamp_ns
+                    if block in self._blocks:  # it came twice, and would count as another one
+                        return
+                    self._blocks.add(block)
                 self._recording.write(full, name, time.time_ns(), cdr, qos)
                 self._counts[topic] += 1
                 if topic == "poles":

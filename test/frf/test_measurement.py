@@ -162,6 +162,19 @@ def test_a_lost_block_is_said_and_what_follows_left_out(channels):
     assert frf.periods == 2
 
 
+def test_a_block_that_comes_twice_changes_nothing(channels):
+    u, y = channels
+    once, twice = MeasurementFrf(1), MeasurementFrf(1)
+    for p in range(3):
+        block = record(u[0, p], y[0, p], 0, p, force_n=0.01 + 0.001 * p)
+        once.add(block, excitation(0))
+        for _ in range(2 if p == 1 else 1):
+            twice.add(block, excitation(0))
+    assert (twice.frf().status, twice.frf().message) == (FrfStatus.OK, once.frf().message)
+    np.testing.assert_array_equal(twice.frf().g, once.frf().g)
+    assert twice.origin().contact.force_n == once.origin().contact.force_n
+
+
 def test_nothing_but_later_blocks_is_a_failure_with_a_reason(channels):
     u, y = channels
     measurement = MeasurementFrf(1)

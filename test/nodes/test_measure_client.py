@@ -119,11 +119,13 @@ def test_a_measurement_is_complete_with_all_of_its_excitations(nodes, tmp_path):
         tell("excitation", excitation_id=4)
         for excitation_id in (4, 5):  # two realisations of a block each
             for topic in ("record", "frf", "poles"):
-                tell(topic, excitation_id=excitation_id)
+                for _ in range(2):  # what comes twice is one block all the same
+                    tell(topic, excitation_id=excitation_id)
         without = "of 2 blocks came 2 records, 2 FRFs, 2 poles; excitations without a message: 1"
         assert spin_until(executor, lambda: recorder.missing(2) == without)
         tell("excitation", excitation_id=5)
         assert spin_until(executor, lambda: recorder.missing(2) == "")
         assert recorder.missing(3).startswith("of 3 blocks came 2 records")
+        assert recorder.poles.qsize() == 2
         recorder.stop()
         recording.finish(PointResult(0, measurement_id=KEY))
