@@ -28,6 +28,7 @@ from tactile_resonance.scan.hands import Check, Hands, Touch
 from tactile_resonance.scan.plan import Plan, plan_points
 from tactile_resonance.scan.preparation import prepare
 from tactile_resonance.scan.progress import Phase, Progress
+from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_run_scene
@@ -148,7 +149,12 @@ def start_run(
 
 
 def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
-    run = RunDirectory.open(path)
+    try:
+        run = RunDirectory.open(path)
+    except OSError as error:  # the disk is still full
+        safe, reason = len(read_run(path).latest), error.strerror or error
+        text = f"run: {path}: {reason}; {safe} points are safe in it, resume goes on"
+        raise ValueError(text) from error
     try:
         facts = run.content.facts
         # where the table is known better now, that is another place

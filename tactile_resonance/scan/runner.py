@@ -100,36 +100,44 @@ class ScanRunner:
 
     def run(self) -> Summary:
         """Finish every point that is not; references, of free air and silent, are taken before and after."""
-        begun_s = self._hands.now_s()
-        message = ""
         try:
-            self._hands.retract()
-            if Output.SILENT in self._scene.outputs:
-                self._reference(SILENT)
-            self._reference(BEFORE)
-            self._air = read_reference(self._run.content, BEFORE)
-            while (point := self._next()) is not None:
-                spent_s = self._hands.now_s() - begun_s
-                if spent_s > self._scene.time_limits.scan_s:
-                    raise ScanEnded(f"time_limits.scan_s: {spent_s:.0f} s are over")
-                self._point(point)
-            self._reference(AFTER)
-            if self._scene.protocols:
-                # only here: what is compiled for the fits takes a second to load
-                from tactile_resonance.scan.tissue_tests import fits_of, write_fits
+            message = self._ended_by(self._all_points)
+        finally:
+            left = self._ended_by(self._hands.retract)
+        return self._summary(_joined(message, left))
 
-                write_fits(self._run.path, list(fits_of(self._run.content)))
+    def _all_points(self) -> None:
+        begun_s = self._hands.now_s()
+        self._hands.retract()
+        if Output.SILENT in self._scene.outputs:
+            self._reference(SILENT)
+        self._reference(BEFORE)
+        self._air = read_reference(self._run.content, BEFORE)
+        while (point := self._next()) is not None:
+            spent_s = self._hands.now_s() - begun_s
+            if spent_s > self._scene.time_limits.scan_s:
+                raise ScanEnded(f"time_limits.scan_s: {spent_s:.0f} s are over")
+            self._point(point)
+        self._reference(AFTER)
+        if self._scene.protocols:
+            # only here: what is compiled for the fits takes a second to load
+            from tactile_resonance.scan.tissue_tests import fits_of, write_fits
+
+            write_fits(self._run.path, list(fits_of(self._run.content)))
+
+    def _ended_by(self, do: Callable[[], object]) -> str:
+        """Do something; why the scan ends there, empty where it does not."""
+        try:
+            do()
         except ScanEnded as error:
-            message = str(error)
+            return str(error)
         except Interrupted:
-            message = "cancelled"
+            return "cancelled"
         except OSError as error:  # the disk is full, or gone
             safe = len(self._run.content.latest)
             reason = error.strerror or error
-            message = f"{self._run.path}: {reason}; {safe} points are safe in it, resume goes on"
-        finally:
-            self._hands.retract()
-        return self._summary(message)
+            return f"{self._run.path}: {reason}; {safe} points are safe in it, resume goes on"
+        return ""
 
     def _next(self) -> ScanPoint | None:
         """The point to touch next; waits while the scan is paused or a node is away."""
@@ -432,4 +440,4 @@ class ScanRunner:
 
 def _joined(text: str, more: str) -> str:
     """Two reasons as one."""
-    return f"{text}; {more}" if text else more
+    return "; ".join(filter(None, (text, more)))

@@ -257,6 +257,26 @@ def test_what_cannot_go_on_ends_with_its_reason_and_the_tip_free(tmp_path):
     assert not bench.holding
 
 
+def test_a_tip_that_cannot_be_drawn_back_hides_neither_the_cause_nor_what_is_done(tmp_path):
+    class Held(Bench):
+        gone = False
+
+        def retract(self):
+            if self.gone:
+                raise ScanEnded("the tip is held")
+            return super().retract()
+
+    def silent(bench, blocks):
+        if bench.log[-1] == ("touch", 2):
+            bench.gone = True
+            raise ScanEnded("/contact_node is silent for 60 s")
+
+    summary, run, _ = scan(tmp_path / "run", scene(), Held(on_measure=silent))
+    assert summary.message == "/contact_node is silent for 60 s; the tip is held"
+    assert (summary.complete, summary.done) == (False, 2)
+    assert run.next_point.index == 2
+
+
 def test_a_full_disk_ends_the_scan_with_its_path_and_what_is_safe(tmp_path):
     def full(bench, blocks):
         if bench.log[-1] == ("touch", 2):
