@@ -146,10 +146,15 @@ def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
     first = os.getpid() % 100
     for step in range(100):
         domain = 1 + (first + step) % 100  # 1..100: portable, below the ephemeral ports
-        ports = range(7410 + 250 * domain, 7400 + 250 * (domain + 1), 2)
-        if all(map(_port_is_free, ports)):
+        if domain_is_free(domain):
             return domain
     raise RuntimeError("ROS_DOMAIN_ID: none of 1..100 is free on this machine, set one")
+
+
+def domain_is_free(domain: int) -> bool:
+    """Whether no participant of a ROS domain is on this machine."""
+    ports = range(7410 + 250 * domain, min(7400 + 250 * (domain + 1), 65536), 2)
+    return all(map(_port_is_free, ports))
 
 
 def _port_is_free(port: int) -> bool:

@@ -18,7 +18,13 @@ from typing import TYPE_CHECKING, Any
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.calibration.file import read_calibration
-from tactile_resonance.processes import ENDING, NodeProcesses, free_domain_id, may_take_priority
+from tactile_resonance.processes import (
+    ENDING,
+    NodeProcesses,
+    domain_is_free,
+    free_domain_id,
+    may_take_priority,
+)
 from tactile_resonance.simulation.plant.defaults import PRIORITY
 
 if TYPE_CHECKING:
@@ -31,6 +37,9 @@ NODES = bringup.NODES[:-1]
 # simulated robot and the control loop.
 COMPUTING = ("excitation_node", "frf_node", "poles_node", "pole_map_node", "scan_node")
 NICENESS = 10
+HUNG_AFTER_S = 60.0
+"""A scan_node that is silent for so long hangs; it reports each second, and watches the other nodes itself."""
+LOOK_S = 3.0  # nodes in a domain are found within this
 START_WITHIN_S = 300.0  # they come up in seconds; a machine with much else to do takes longer
 INTERRUPTED = 130
 
@@ -165,6 +174,7 @@ def run_job(job: Job) -> int:
     if not job.resume:
         RunDirectory.check_new(job.output, 0)
     job = replace(job, host=take_domain(job.host))
+    require_own_domain()
     ended = _Ended()
     print(
         f"scan of {content.name}, simulated. To listen: ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} "
@@ -186,20 +196,47 @@ def run_job(job: Job) -> int:
         nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
         try:
             result = _scan(nodes, job, ended)
-        except RuntimeError as error:
-            raise ValueError(f"{error} (logs in {work / 'log'})") from error
+        except (RuntimeError, ValueError) as error:
+            text = f"{error} (logs in {work / 'log'}){_way_on(job)}"
+            raise ValueError(text) from error
         except KeyboardInterrupt as error:
-            if not (job.output / "scene.yaml").exists():
-                raise
-            text = f"; tactile_resonance resume {job.output} goes on with the run"
-            raise KeyboardInterrupt(text) from error
+            raise KeyboardInterrupt(_way_on(job)) from error
     ended.check()
     ended.at_once()  # every file of a report is whole or not there
     if result.ending is Ending.COMPLETE:  # each simulated record that counts is in the run
         shutil.rmtree(work / "records", ignore_errors=True)
-    report.report_run(job.output)
+    try:
+        report.report_run(job.output)
+    except OSError as error:
+        if result.ending is Ending.COMPLETE:
+            raise
+        print(f"no report: {error}")  # the disk that ended the scan
     print(f"{result.sensor_health}\n{time.monotonic() - begun_s:.1f} s in all; run in {job.output}")
-    return 0 if result.ending is Ending.COMPLETE and result.done else 1
+    if result.ending is not Ending.COMPLETE:
+        raise ValueError(f"{result.message}{_way_on(job)}")
+    return 0 if result.done else 1
+
+
+def _way_on(job: Job) -> str:
+    """How a person goes on with a run that has ended early; empty where none was begun."""
+    if not (job.output / "run.json").exists():
+        return ""
+    return f"; tactile_resonance resume {job.output} goes on with the run"
+
+
+def require_own_domain() -> None:
+    """``ValueError`` where the ROS domain has nodes of another session: each would take the other's goals."""
+    from tactile_resonance.nodes.client import ScanClient
+
+    domain = free_domain_id()
+    if domain_is_free(domain):
+        return
+    with ScanClient(lambda: None) as client:
+        if found := client.nodes_there(bringup.NODES, LOOK_S):
+            raise ValueError(
+                f"ROS_DOMAIN_ID: {domain} has {', '.join(found)} of another session; accepted is a domain "
+                "without them, unset it and one is taken"
+            )
 
 
 def require_packages(*packages: str) -> None:
@@ -272,10 +309,13 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     if not job.resume:
         goal |= {"scene": job.scene, "seed": job.seed, "notes": job.notes}
     up = False
+    silence = Silence()
 
     def check() -> None:
         ended.check()
         nodes.check()
+        if up and silence.lasts_s(client.heard["scan_node"]) > HUNG_AFTER_S:
+            raise RuntimeError(f"scan_node hangs: it is silent for {HUNG_AFTER_S:g} s")
         state, _, reason = client.states.get("fake_hardware_node", "").partition(": ")
         if not up and state == "unconfigured" and reason:
             raise ValueError(f"the simulated bench does not start: {reason}")
@@ -295,6 +335,21 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     if stalls:
         print(f"the simulation itself stood still for more than 10 ms: {stalls} times")
     return result
+
+
+class Silence:
+    """How long a count has stood still, by time in which this process ran."""
+
+    def __init__(self) -> None:
+        self._count, self._stood_s, self._looked_s = -1, 0.0, time.monotonic()
+
+    def lasts_s(self, count: int) -> float:
+        """To be asked several times a second."""
+        now_s = time.monotonic()
+        step_s = min(now_s - self._looked_s, 1.0)  # more: this process was stopped
+        self._stood_s = self._stood_s + step_s if count == self._count else 0.0
+        self._count, self._looked_s = count, now_s
+        return self._stood_s
 
 
 class _Bar:

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -131,6 +132,8 @@ class ScanClient(NodeClient):
     tactile : TactileClient
     states : dict
         The latest diagnostics of each node, by its name.
+    heard : Counter
+        How often each node has sent diagnostics.
     """
 
     def __init__(
@@ -139,6 +142,7 @@ class ScanClient(NodeClient):
         super().__init__(name, check)
         self._namespace = namespace
         self.states: dict[str, str] = {}
+        self.heard: Counter[str] = Counter()
         self._details: dict[str, dict[str, str]] = {}
 
     def join(self) -> None:
@@ -150,6 +154,17 @@ class ScanClient(NodeClient):
         """State of each node from the diagnostics."""
         told = "; ".join(f"{name}: {state}" for name, state in sorted(self.states.items()))
         return told or "no diagnostics"
+
+    def nodes_there(self, wanted: Collection[str], within_s: float) -> list[str]:
+        """Nodes of these names in this namespace, of whomever; looked for until one is found or for so long."""
+        deadline = time.monotonic() + within_s
+        found: list[str] = []
+        while not found and time.monotonic() < deadline:
+            self.spin(0.05)
+            there = self._node.get_node_names_and_namespaces()
+            own = self._node.get_namespace()
+            found = sorted({name for name, where in there if where == own and name in wanted})
+        return found
 
     def details(self, node: str) -> dict[str, str]:
         """Figures of a node's diagnostics, as heard last."""
@@ -191,6 +206,7 @@ class ScanClient(NodeClient):
             if str(Path(status.name).parent) != self._node.get_namespace():
                 continue  # of another sensor
             name = Path(status.name).name
+            self.heard[name] += 1
             self._details[name] = {value.key: value.value for value in status.values}
             # a node reports for seconds why it does not come up, then only that it has not
             refused = self.states.get(name, "").startswith(f"{status.message}: ")

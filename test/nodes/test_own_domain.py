@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A session does not begin among the nodes of another one, and does not wait for a scan_node that hangs."""
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not here")
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+import rclpy
+
+from tactile_resonance.commands import bench_scan
+from tactile_resonance.commands.bench_scan import Silence, require_own_domain
+from tactile_resonance.nodes.running import initialised
+from tactile_resonance.processes import domain_is_free, free_domain_id
+
+
+@pytest.mark.parametrize(
+    ("name", "namespace", "refused"),
+    [("scan_node", "", True), ("scan_node", "/left", False), ("rviz", "", False)],
+)
+def test_a_domain_with_nodes_of_another_session_is_refused(monkeypatch, name, namespace, refused):
+    domain = free_domain_id({})
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    require_own_domain()  # nobody is there
+    with initialised(domain_id=domain):
+        node = rclpy.create_node(name, namespace=namespace)
+        assert not domain_is_free(domain)
+        if refused:
+            with pytest.raises(ValueError, match=rf"ROS_DOMAIN_ID: {domain} has scan_node of another"):
+                require_own_domain()
+        else:
+            require_own_domain()
+        node.destroy_node()
+
+
+def test_silence_counts_only_while_this_process_runs(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(bench_scan.time, "monotonic", lambda: now[0])
+    silence = Silence()
+
+    def after(seconds, count):
+        now[0] += seconds
+        return silence.lasts_s(count)
+
+    assert after(0.5, 1) == 0
+    assert after(0.5, 1) == 0.5
+    assert after(3600.0, 1) == 1.5  # stopped meanwhile, as by Ctrl-Z
+    assert after(0.5, 2) == 0
+    assert after(0.5, 2) == 0.5
