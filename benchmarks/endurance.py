@@ -1,26 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run of ten thousand points: time of a point, memory, open files, resuming, map; simulated, in virtual time.
+"""A run of ten thousand points: what a point, its map and its summaries cost, memory, open files; simulated.
 
-`tools/run.sh python -m benchmarks.endurance [POINTS]` writes ``docs/benchmarks/endurance.md``.
+With nodes it is `benchmarks.endurance_nodes`.
 """
 
 from __future__ import annotations
 
 import os
-import sys
+import textwrap
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from benchmarks.skip_hands import VirtualHands
+from tactile_resonance.commands.report import report_run
 from tactile_resonance.files import write_whole
 from tactile_resonance.scan.map_messages import cloud_message, marker_message, surface_message
-from tactile_resonance.scan.messages import header_message, to_cdr
+from tactile_resonance.scan.messages import header_message, message_types, to_cdr
 from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.pole_map import MapPoint, PoleMap
+from tactile_resonance.scan.point_file import FileContent
+from tactile_resonance.scan.point_result import TYPE, PointResult, from_message
+from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
 from tactile_resonance.scan.progress import Controls
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
@@ -42,19 +48,39 @@ class Part:
     ----------
     points : int
         Finished at its end.
-    point_ms, computing_ms : float
-        Median of a point on this machine's clock [ms]: in all, and from samples to poles.
+    wall_ms : float
+        Median of a point on this machine's clock [ms].
+    point_ms, poles_ms, summary_ms, map_ms : float
+        Median processor time of a point [ms]: all of the scan, of it from samples to poles and for summaries
+        (``results.csv``, and the bag's metadata, which are a mean), and beside it what a map node does.
+    drawn_ms : tuple of float
+        Processor time of one cloud, one array of markers, one surface [ms].
     memory_mb : float
-        Resident at its end.
+        Resident at its end, before the map is drawn.
     files : int
         Open at its end.
     """
 
     points: int
+    wall_ms: float
     point_ms: float
-    computing_ms: float
+    poles_ms: float
+    summary_ms: float
+    map_ms: float
+    drawn_ms: tuple[float, ...]
     memory_mb: float
     files: int
+
+
+class TimedRun(RunDirectory):
+    """A run that tells the processor time of its summaries [s]."""
+
+    summaries_s = 0.0
+
+    def _add(self, file: FileContent, result: PointResult | None) -> None:
+        begun_s = time.process_time()
+        super()._add(file, result)
+        self.summaries_s += time.process_time() - begun_s
 
 
 def content(points: int) -> dict[str, object]:
@@ -77,75 +103,131 @@ def memory_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def run(output: Path, points: int = POINTS) -> str:
-    """Scan, resume, draw; write ``endurance.md`` into `output`, and return the page."""
-    parts: list[Part] = []
-    times_s, computing_s = [time.perf_counter()], [0.0]
+class Course:
+    """Takes a scan's results as a map node does, and notes what each point took."""
+
+    def __init__(self, points: int) -> None:
+        self._tenth = max(1, points // PARTS)
+        self._times: list[tuple[float, ...]] = []
+        self.map_s = 0.0
+        self.grown = GrowingMap()
+        self.parts: list[Part] = []
+
+    def take(self, cdr: bytes, *others_s: float) -> None:
+        """After a point; clocks of the scan beside those of this process [s]."""
+        begun_s = time.process_time()
+        self.grown.take(from_message(message_types().deserialize_cdr(cdr, TYPE)))
+        self.map_s += time.process_time() - begun_s
+        clocks_s = time.perf_counter(), time.process_time() - self.map_s, *others_s, self.map_s
+        self._times.append(clocks_s)
+        if len(self._times) % self._tenth == 0:
+            self._end_part()
+
+    def _end_part(self) -> None:
+        files, held_mb = len(os.listdir("/proc/self/fd")), memory_mb()
+        steps_ms = 1e3 * np.diff(self._times[-self._tenth :], axis=0)  # (points - 1, clocks)
+        wall, point, poles, _, on_map = np.median(steps_ms, axis=0).tolist()
+        summary = float(np.mean(steps_ms[:, 3]))
+        drawn = tuple(drawn_ms(self.grown.map))
+        count = len(self._times)
+        self.parts.append(Part(count, wall, point, poles, summary, on_map, drawn, held_mb, files))
+        # what drawing took is of no point
+        self._times = [(float("nan"),) * 5] * count
+        print(self.parts[-1], flush=True)
+
+
+def drawn_ms(pole_map: PoleMap) -> Iterator[float]:
+    """Processor time of the messages of a map [ms]: cloud, markers, surface."""
+    header = header_message("table", 1)
+    for make in (
+        lambda: cloud_message(pole_map, (), header),
+        lambda: marker_message(pole_map, pole_map.ellipse_scale(), 0.95, header),
+        lambda: surface_message(pole_map, 40, header),
+    ):
+        begun_s = time.process_time()
+        to_cdr(make())
+        yield 1e3 * (time.process_time() - begun_s)
+
+
+def run(output: Path, quick: bool, points: int = POINTS) -> str:
+    """Scan, resume, read, report; write ``endurance.md`` into `output`, and return the page."""
+    points = points // PARTS if quick else points
     with TemporaryDirectory() as folder:
         path, target = Path(folder) / "scene.yaml", Path(folder) / "run"
         text = dump_yaml(content(points))
         path.write_text(text)
         plan = make_plan(read_scan_scene(path))
-        count = len(plan.points)
         hands = VirtualHands(read_scene(read_tissues(), path), 1.2)
+        course = Course(len(plan.points))
+        with TimedRun.create(target, text, plan.points, {"seed": 1}) as made:
 
-        def publish(_: bytes) -> None:
-            """After each point."""
-            times_s.append(time.perf_counter())
-            computing_s.append(hands.computing_s)
-            done = len(times_s) - 1
-            if done * PARTS % count < PARTS:
-                own = slice(-(count // PARTS) - 1, None)
-                point_ms, poles_ms = (
-                    1e3 * float(np.median(np.diff(each[own]))) for each in (times_s, computing_s)
-                )
-                files = len(list(Path("/proc/self/fd").iterdir()))
-                parts.append(Part(done, point_ms, poles_ms, memory_mb(), files))
-                print(parts[-1], flush=True)
+            def publish(cdr: bytes) -> None:
+                course.take(cdr, hands.computing_s, made.summaries_s)
 
-        with RunDirectory.create(target, text, plan.points, {"seed": 1}) as made:
             ScanRunner(plan, made, hands, Controls(), lambda progress: None, 1, publish).run()
         size_mb = sum(file.stat().st_size for file in target.rglob("*") if file.is_file()) / 1e6
-        begun_s = time.perf_counter()
-        with RunDirectory.open(target):
-            resumed_s = time.perf_counter() - begun_s
-        begun_s = time.perf_counter()
-        pole_map = PoleMap(tuple(MapPoint.planned(each) for each in read_run(target).latest))
-        read_s = time.perf_counter() - begun_s
-        header, drawn_s = header_message("table", 1), []
-        for make in (
-            lambda: cloud_message(pole_map, (), header),
-            lambda: marker_message(pole_map, pole_map.ellipse_scale(), 0.95, header),
-            lambda: surface_message(pole_map, 40, header),
+        clocks_s = []
+        for action in (
+            lambda: RunDirectory.open(target).close(),
+            lambda: read_run(target),
+            lambda: report_run(target),
         ):
-            begun_s = time.perf_counter()
-            to_cdr(make())
-            drawn_s.append(time.perf_counter() - begun_s)
-    page = "\n".join(
-        [
-            f"# A run of {count} points",
-            "",
-            "`tools/run.sh python -m benchmarks.endurance`. Simulated, in virtual time and one process: the",
-            "runner, the folder and the estimator as scan_node, frf_node and poles_node use them; no robot,",
-            "no nodes. Times are of this machine's clock, medians over each tenth.",
-            "",
-            "| points | a point [ms] | of it samples to poles [ms] | memory [MB] | open files |",
-            "|---:|---:|---:|---:|---:|",
-            *(
-                f"| {p.points} | {p.point_ms:.1f} | {p.computing_ms:.1f} | {p.memory_mb:.0f} | {p.files} |"
-                for p in parts
-            ),
-            "",
-            f"The folder has {size_mb:.0f} MB. Opened again to go on: {resumed_s:.1f} s, every byte of the "
-            f"recording compared with its checksum. Read for the map: {read_s:.1f} s.",
-            f"Messages for rviz: cloud {drawn_s[0]:.2f} s, ellipses {drawn_s[1]:.1f} s, kriged surface "
-            f"{drawn_s[2]:.1f} s.",
-            "",
-        ]
-    )
+            begun_s, begun_cpu_s = time.perf_counter(), time.process_time()
+            with redirect_stdout(StringIO()):
+                action()
+            clocks_s += [time.perf_counter() - begun_s, time.process_time() - begun_cpu_s]
+            print(clocks_s, flush=True)
+    page = _page(course.parts, size_mb, clocks_s)
     write_whole(output / "endurance.md", page.encode())
     return page
 
 
-if __name__ == "__main__":
-    print(run(Path("docs/benchmarks"), int(sys.argv[1]) if len(sys.argv) > 1 else POINTS))
+def _page(parts: Sequence[Part], size_mb: float, clocks_s: Sequence[float]) -> str:
+    rows = [
+        f"| {p.points} | {p.wall_ms:.1f} | {p.point_ms:.1f} | {p.poles_ms:.1f} | {p.summary_ms:.2f} | "
+        f"{p.map_ms:.2f} | {' | '.join(f'{ms:.0f}' for ms in p.drawn_ms)} | {p.memory_mb:.0f} | {p.files} |"
+        for p in parts
+    ]
+    first, last = parts[0], parts[-1]
+    ratios = [
+        getattr(last, name) / getattr(first, name) for name in ("point_ms", "map_ms", "summary_ms")
+    ]
+    return "\n".join(
+        [
+            "# Endurance",
+            "",
+            *textwrap.wrap((__doc__ or "").split("\n")[0], 112),
+            "",
+            *textwrap.wrap(
+                "Simulated, in virtual time and one process: the runner, the folder and the estimator as "
+                "scan_node, frf_node and poles_node use them; no robot, no nodes (those: "
+                "[with the robot](endurance_robot.md), [an hour](endurance_hour.md)). Medians over each "
+                "tenth of processor times, which other work on the machine changes little, and of its "
+                "clock, which it does change. Summaries are the row of `results.csv` and, after each "
+                "twentieth of the points, the bag's metadata: their mean. Map: what a map node does with "
+                "each result. It draws the messages (cloud, markers, surface) only where "
+                "somebody listens, and for at most a tenth of its time.",
+                112,
+            ),
+            "",
+            "| points | a point, clock [ms] | processor [ms] | of it poles [ms] | of it summaries [ms] | "
+            "map [ms] | cloud [ms] | markers [ms] | surface [ms] | memory [MB] | open files |",
+            "|" + "---:|" * 11,
+            *rows,
+            "",
+            *textwrap.wrap(
+                f"Last tenth over first: point {ratios[0]:.2f}, map {ratios[1]:.2f}, summaries "
+                f"{ratios[2]:.2f}; memory {last.memory_mb - first.memory_mb:+.0f} MB.",
+                112,
+            ),
+            "",
+            *textwrap.wrap(
+                f"The folder has {size_mb:.0f} MB. Times on the clock, of the processor in brackets: "
+                f"opened again to go on {clocks_s[0]:.1f} s ({clocks_s[1]:.1f} s), every byte of the "
+                f"recording compared with its checksum; read {clocks_s[2]:.1f} s ({clocks_s[3]:.1f} s); "
+                f"`report` {clocks_s[4]:.0f} s ({clocks_s[5]:.0f} s).",
+                112,
+            ),
+            "",
+        ]
+    )

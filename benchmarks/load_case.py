@@ -150,7 +150,7 @@ def demonstrate(
 
     with ExitStack() as stack:
         for _ in range(load.busy_loops):
-            stack.enter_context(_busy_loop(cores))
+            stack.enter_context(busy_loop(cores))
         begun_s = time.monotonic()
         demo = subprocess.Popen(
             command,
@@ -336,7 +336,7 @@ def _throttle(demo: subprocess.Popen) -> None:
 
 
 @contextmanager
-def _busy_loop(cores: set[int]) -> Iterator[None]:
+def busy_loop(cores: set[int]) -> Iterator[None]:
     process = subprocess.Popen(
         [sys.executable, "-c", "while True: pass"],
         preexec_fn=lambda: (end_with_parent(), os.sched_setaffinity(0, cores)),

@@ -12,7 +12,7 @@ NAMES = (
     *("frf", "poles", "bench", "contact", "touch", "robot"),
     *("twist", "cell", "recording", "pipeline", "live", "load"),
     *("truth", "skip", "references", "report", "mechanics", "calibrate"),
-    *("stability", "hostile", "overview"),
+    *("stability", "hostile", "endurance", "overview"),
 )
 WITH_FULL = ("contact", "hostile")
 """Those with a larger grid than they run by default."""

@@ -34,6 +34,13 @@ PARAMETERS = (
     contact_source.PARAMETER,
     TIME_SERVER,
     HUNG_AFTER,
+    Parameter(
+        "keep_all_records",
+        False,
+        "Keep in record_folder what the run of a scan holds, too. Else the records of a point that is done are "
+        "removed there as soon as point_result tells that all of them are in its run, on the disk.",
+        read_only=True,
+    ),
     Parameter("block_timeout_s", 10.0, "Longest wait for a block [s].", 0.1, 3600.0),
 )
 
@@ -53,7 +60,8 @@ class Cancelled(Exception):
 class ExcitationNode(ManagedNode):
     """Action `measure`; publishes `excitation` (latched), `record`; of a run it replays `point_result`.
 
-    Every record is in its file before it is published, and on the disk before the next is read. Records carry
+    Every record is in its file before it is published, and on the disk before the next is read; the files go
+    once the run of a scan has all of them. Records carry
     the place of the tip and the mean force over the block, where the device is no replay; they never wait
     long for it. The device is read in a thread of its own, so that its blocking calls never hold up the
     executor.
@@ -73,6 +81,8 @@ class ExcitationNode(ManagedNode):
         self._replayed = devices.replayed_results(self)
         if self._replayed:
             self._results = self.publish_on(msg.PointResult, "point_result", POINT_RESULTS)
+        elif not values(self, "keep_all_records")[0]:
+            self.listen(msg.PointResult, "point_result", self._on_result, POINT_RESULTS)
         self._store: RecordStore | None = None
         self._has_store = False
         self._contact = contact_source.make_contact_source(self)
@@ -86,6 +96,11 @@ class ExcitationNode(ManagedNode):
         """Tell what became of the points of a run that is played again."""
         for result in self._replayed:
             self._results.publish(result)
+
+    def _on_result(self, message: msg.PointResult) -> None:
+        """Records are kept once: a scan waits for all of a point before it is done, and writes them first."""
+        if self._store is not None and message.outcome == message.OUTCOME_DONE:
+            self._store.remove(message.measurement_id)
 
     def _on_cancel(self, goal: ServerGoalHandle) -> None:
         """At once where the device can, for a block under way is of no use to anybody."""

@@ -30,8 +30,8 @@ from tactile_resonance.scan.map_messages import (
 )
 from tactile_resonance.scan.messages import header_message, to_cdr
 from tactile_resonance.scan.point_outcome import with_poles
-from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult, from_message
-from tactile_resonance.scan.pole_map import EllipseScale, MapPoint, PoleMap
+from tactile_resonance.scan.point_result import PointOutcome, PointResult, from_message
+from tactile_resonance.scan.pole_map import EllipseScale, GrowingMap, MapPoint, PoleMap, counts
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import read_classes
@@ -133,7 +133,7 @@ class PoleMapNode(ManagedNode):
     """
 
     # diagnostics ask for them from the beginning
-    _map = PoleMap()
+    _grown = GrowingMap()
     _left_out = 0
 
     def __init__(self) -> None:
@@ -153,7 +153,7 @@ class PoleMapNode(ManagedNode):
         low, high = numbers(list(values(self, "boundary_f0_hz")[0]), "boundary_f0_hz", 2)
         ends = low or -math.inf, high or math.inf
         self._wanted = build(LevelSet, "boundary_f0_hz", *ends) if low or high else None
-        self._map = PoleMap()
+        self._grown = GrowingMap()
         self._left_out = 0
         kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
         self._old: set[str] = set()  # outputs that show less than is known
@@ -185,8 +185,8 @@ class PoleMapNode(ManagedNode):
     def details(self) -> Mapping[str, str]:
         """For the diagnostics."""
         return {
-            "points": str(len(self._map.estimated)),
-            "failures": str(len(self._map.failures)),
+            "points": str(len(self._grown.map.estimated)),
+            "failures": str(len(self._grown.map.failures)),
             "left out": str(self._left_out),
         }
 
@@ -194,20 +194,21 @@ class PoleMapNode(ManagedNode):
         self.health.saw("poles")
         point = self._point(message)
         if point is not None:
-            self._set(self._map.with_point(point))
+            self._grown.add(point)
+            self._renew()
 
     def _on_result(self, message: msg.PointResult) -> None:
         """The latest result of a point of tissue that is not discarded replaces what was there before."""
         self.health.saw("point_result")
         result = from_message(message)
-        if result.kind is not PointKind.TISSUE or result.outcome is PointOutcome.DISCARDED:
+        if not counts(result):
             return
-        now = self._map.without(result)
+        self._grown.clear(result)
         if result.outcome is not PointOutcome.SKIPPED and message.poles:
             point = self._point(message.poles[0], result)
             if point is not None:
-                now = now.with_point(point)
-        self._set(now)
+                self._grown.add(point)
+        self._renew()
 
     def _point(self, message: msg.Poles, result: PointResult | None = None) -> MapPoint | None:
         """Where poles lie on the map; None where they do not, with the reason in the diagnostics.
@@ -249,13 +250,14 @@ class PoleMapNode(ManagedNode):
         return point
 
     def _on_clear(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.message = f"{len(self._map.points)} points cleared"
+        response.message = f"{len(self._grown)} points cleared"
         response.success = True
-        self._set(PoleMap())
+        self._grown = GrowingMap()
+        self._renew()
         return response
 
-    def _set(self, pole_map: PoleMap) -> None:
-        self._map = pole_map
+    def _renew(self) -> None:
+        """Show the map, which is another than before."""
         self._old = set(self._publishers_of)
         self._show()
 
@@ -280,13 +282,14 @@ class PoleMapNode(ManagedNode):
     def _publish(self, wanted: set[str]) -> None:
         (probability, cells) = values(self, "ellipse_probability", "surface_cells")
         header = header_message(self._frame_id, self.get_clock().now().nanoseconds)
-        scale = self._scale(probability)
+        pole_map = self._grown.map
+        scale = self._scale(pole_map, probability)
         names = tuple(tissue.name for tissue in self._classes)
         makers: dict[str, Callable[[], Any]] = {
-            "": lambda: cloud_message(self._map, names, header),
-            "/markers": lambda: marker_message(self._map, scale, probability, header, self._wanted),
-            "/legend": lambda: legend_message(self._map, scale, probability, names, header),
-            "/surface": lambda: surface_message(self._map, cells, header),
+            "": lambda: cloud_message(pole_map, names, header),
+            "/markers": lambda: marker_message(pole_map, scale, probability, header, self._wanted),
+            "/legend": lambda: legend_message(pole_map, scale, probability, names, header),
+            "/surface": lambda: surface_message(pole_map, cells, header),
         }
         for name in wanted:
             self._shown[name] = makers[name]()
@@ -306,9 +309,9 @@ class PoleMapNode(ManagedNode):
         ended_s = time.monotonic()
         self._repeat_from_s = ended_s + (ended_s - begun_s) / BUSY_SHARE
 
-    def _scale(self, probability: float) -> EllipseScale:
+    def _scale(self, pole_map: PoleMap, probability: float) -> EllipseScale:
         m_per_hz, m_per_damping = values(self, "ellipse_m_per_hz", "ellipse_m_per_damping")
-        fitting = self._map.ellipse_scale(probability)
+        fitting = pole_map.ellipse_scale(probability)
         return EllipseScale(m_per_hz or fitting.m_per_hz, m_per_damping or fitting.m_per_damping)
 
 

@@ -32,12 +32,14 @@ class RecordStore:
     Parameters
     ----------
     folder : Path
-        Made at the first measurement where it does not exist; several runs may share it.
+        Made at the first measurement where it does not exist; several runs may share it, one after the other.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._measurements: dict[int, Path] = {}
+        self._known: set[int] | None = None  # ids of all that was ever here; None: not looked yet
+        self._number = 0  # of the newest
 
     def begin(self, excitations: Sequence[Excitation]) -> None:
         """Prepare for a measurement, before anything of it is played.
@@ -59,8 +61,11 @@ class RecordStore:
         self.folder.mkdir(parents=True, exist_ok=True)
         if not existed:
             sync_folder(self.folder.parent)
-        entries, _ = list_measurements(self.folder)
-        if key in {entry.measurement_id for entry in entries}:
+        if self._known is None:
+            entries, _ = list_measurements(self.folder)
+            self._known = {entry.measurement_id for entry in entries}
+            self._number = int(entries[-1].path.name.split("-")[0]) if entries else 0
+        if key in self._known:
             raise ValueError(
                 f"measurement_id: {key} is in {self.folder} already, expected a new one"
             )
@@ -71,10 +76,11 @@ class RecordStore:
                 f"record_folder: {self.folder} has {free / 1e6:.0f} MB free, the measurement may "
                 f"take {planned / 1e6:.0f} MB"
             )
-        number = 1 + (int(entries[-1].path.name.split("-")[0]) if entries else 0)
-        path = self.folder / f"{number:06d}-{key}"
+        path = self.folder / f"{self._number + 1:06d}-{key}"
         path.mkdir()
         sync_folder(self.folder)
+        self._number += 1
+        self._known.add(key)
         self._measurements[key] = path
 
     def add_excitation(self, excitation: Excitation) -> None:
@@ -90,6 +96,12 @@ class RecordStore:
         folder = self._folder_of(record.origin.measurement_id)
         name = f"record-{record.realisation:05d}-{record.block_index:07d}.npz"
         write_stored(folder / name, record, written)
+
+    def remove(self, measurement_id: int) -> None:
+        """Remove a measurement that this store received and that is safe elsewhere; others stay."""
+        path = self._measurements.pop(measurement_id, None)
+        if path is not None:
+            shutil.rmtree(path, ignore_errors=True)
 
     def _folder_of(self, measurement_id: int) -> Path:
         if measurement_id not in self._measurements:

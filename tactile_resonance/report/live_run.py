@@ -26,7 +26,7 @@ from tactile_resonance.report.page_data import (
 )
 from tactile_resonance.report.point_details import MOST_DETAILED, force_entry
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult, mode_columns
-from tactile_resonance.scan.pole_map import PoleMap
+from tactile_resonance.scan.pole_map import GrowingMap
 
 Publish = Callable[[str, Any], None]
 HOLDING = "hold"  # state of a contact in which is measured
@@ -90,7 +90,7 @@ class LiveRun:
         """Forget the scan before."""
         self._results: dict[int, PointResult] = {}
         self._details: dict[int, dict[str, Any]] = {}
-        self._maps: list[PoleMap] = [PoleMap()]
+        self._maps = [GrowingMap()]
         self._measuring = _Measuring()
         self._newest: int | None = None
         self._state, self._heard_s, self._message = "", -1e9, ""
@@ -135,7 +135,8 @@ class LiveRun:
             bands = max(1 + len(result.further), len(self._maps))
             wider = bands > len(self._maps)
             self._maps += [self._map_of(k) for k in range(len(self._maps), bands)]
-            self._maps = [m.with_result(result.of_band(k)) for k, m in enumerate(self._maps)]
+            for k, grown in enumerate(self._maps):
+                grown.take(result.of_band(k))
             self._map_is_old = True
             measured = self._measuring
             if measured.measurement_id != result.measurement_id:
@@ -153,11 +154,8 @@ class LiveRun:
             details = {str(k): each for k, each in self._details.items() if k == result.index}
             self._publish("point", {"bands": points, "details": details})
 
-    def _map_of(self, band: int) -> PoleMap:
-        pole_map = PoleMap()
-        for result in self._results.values():
-            pole_map = pole_map.with_result(result.of_band(band))
-        return pole_map
+    def _map_of(self, band: int) -> GrowingMap:
+        return GrowingMap(result.of_band(band) for result in self._results.values())
 
     def take_frf(self, message: Any) -> None:
         """FRF of the measurement under way, the latest counts; of ROS or of rosbags."""
@@ -216,7 +214,7 @@ class LiveRun:
                 self._map_from_s = ended_s + (ended_s - begun_s) / _BUSY_SHARE
 
     def _surface(self, band: int) -> dict[str, Any]:
-        pole_map = self._maps[band]
+        pole_map = self._maps[band].map
         surface = pole_map.surface(_CELLS) if len(pole_map.points) <= MOST_OF_A_MAP else None
         return {"band": band, "surface": map_entry(surface, None)["surface"]}
 

@@ -26,8 +26,8 @@ from tactile_resonance.scan.map_messages import (
 )
 from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 from tactile_resonance.scan.point_file import PointFileWriter, offered_qos, read_messages_of_type
-from tactile_resonance.scan.point_result import TYPE, from_message
-from tactile_resonance.scan.pole_map import PoleMap
+from tactile_resonance.scan.point_result import TYPE, PointResult, from_message
+from tactile_resonance.scan.pole_map import GrowingMap, PoleMap, counts
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.tissue.classify import UNKNOWN
 
@@ -59,18 +59,21 @@ def write_map_recording(run: RunContent) -> Path | None:
     OSError
         If it cannot be written.
     """
-    states = list(_states(run))
-    if not states:
+    results = list(_results(run))
+    if not results:
         return None
     with TemporaryDirectory(dir=run.path, prefix=".map-") as hidden:
         writer = PointFileWriter(Path(hidden), Path(hidden) / FILE)
         frame_id = _write_frames(writer, run)
-        step = -(-len(states) // MOST_STATES)
-        last = states[-1][1]
+        step = -(-len(results) // MOST_STATES)
+        last = GrowingMap(result for _, result in results).map
         names = tuple(name for name in last.classes() if name != UNKNOWN)
         wanted = _wanted(run)
-        for time_ns, pole_map in states[::-1][::step][::-1]:  # the last one is among them
-            _write_map(writer, time_ns, pole_map, frame_id, names, wanted)
+        grown = GrowingMap()
+        for done, (time_ns, result) in enumerate(results, start=1):
+            grown.take(result)
+            if (len(results) - done) % step == 0:  # the last one is among them
+                _write_map(writer, time_ns, grown.map, frame_id, names, wanted)
         surface = surface_message(last, _CELLS, header_message(frame_id, time_ns))
         _write(writer, "/pole_map/surface", time_ns, surface, _LATCHED)
         writer.finish()
@@ -78,14 +81,13 @@ def write_map_recording(run: RunContent) -> Path | None:
     return run.path / FILE
 
 
-def _states(run: RunContent) -> Iterator[tuple[int, PoleMap]]:
-    """The map after each result that changed it, and when it was recorded [ns]."""
-    pole_map = PoleMap()
+def _results(run: RunContent) -> Iterator[tuple[int, PointResult]]:
+    """Each result that changed the map, and when it was recorded [ns]."""
     for path in run.paths_in_order:
         for time_ns, _, message in read_messages_of_type(path, TYPE):
-            before, pole_map = pole_map, pole_map.with_result(from_message(message))
-            if pole_map is not before:
-                yield time_ns, pole_map
+            result = from_message(message)
+            if counts(result):
+                yield time_ns, result
 
 
 def _wanted(run: RunContent) -> LevelSet | None:

@@ -7,7 +7,6 @@ import base64
 import html
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from functools import reduce
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from tactile_resonance.report.point_table import repeats_sentence, table_notes
 from tactile_resonance.report.run_tables import Truths
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.point_times import budget_sentence
-from tactile_resonance.scan.pole_map import PoleMap
+from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
 from tactile_resonance.scan.protocols import TYPE as TEST_TYPE
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
@@ -56,7 +55,7 @@ def pole_maps_of(run: RunContent) -> list[PoleMap]:
         return []
     bands = 1 if scene is None else len(scene.sensor.bands)
     maps = [
-        reduce(PoleMap.with_result, (result.of_band(k) for result in run.results), PoleMap())
+        GrowingMap(result.of_band(k) for result in run.results).map
         for k in range(bands)
     ]
     return [pole_map for pole_map in maps if pole_map.points]

@@ -48,18 +48,16 @@ def cloud_message(pole_map: PoleMap, names: tuple[str, ...], header: Message) ->
     names : tuple of str
         Tissue classes: the field ``tissue_class`` is the index into them, `NO_CLASS` for none.
     """
-    points = pole_map.estimated
-    table = np.zeros(len(points), POINT)
-    for row, point in zip(table, points, strict=True):
+    number = {name: k for k, name in enumerate(names)}
+    rows = []
+    for point in pole_map.estimated:
         found = point.result
-        row["x"], row["y"], row["z"] = point.position_m
-        row["f0_hz"], row["damping_ratio"] = found.estimate
-        row["f0_std_hz"], row["damping_std"] = found.std
-        row["force_n"], row["tissue_probability"] = found.force_n, found.tissue_probability
-        known = found.tissue_class in names
-        row["tissue_class"] = names.index(found.tissue_class) if known else NO_CLASS
-        row["status"] = _STATUS.get(found.poles_status, 0)
-    return _cloud(table, header)
+        figures = found.f0_hz, found.damping_ratio, found.f0_std_hz, found.damping_ratio_std
+        called = number.get(found.tissue_class, NO_CLASS)
+        status = _STATUS.get(found.poles_status, 0)
+        of_contact = found.force_n, found.tissue_probability
+        rows.append((*point.position_m, *figures, *of_contact, called, status, b""))
+    return _cloud(np.array(rows, POINT), header)
 
 
 def surface_message(pole_map: PoleMap, cells: int, header: Message) -> Message:

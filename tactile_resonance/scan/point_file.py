@@ -74,7 +74,7 @@ class TopicContent:
 topic_content = cache(TopicContent)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class FileContent:
     """What one finished file holds.
 

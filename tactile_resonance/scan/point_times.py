@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
@@ -24,24 +25,27 @@ FIELD_OF = {
 
 
 class StateTimes:
-    """Of one contact, from its states and the times at which each was seen."""
+    """Of one contact, from its states and the times at which each was seen; for several threads."""
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self.begin()
 
     def begin(self) -> None:
         """Forget what was before."""
-        self._spent_ns: Counter[str] = Counter()
-        self._before: tuple[str, int] | None = None
+        with self._lock:
+            self._spent_ns: Counter[str] = Counter()
+            self._before: tuple[str, int] | None = None
 
     def take(self, state: str, time_ns: int) -> None:
         """The contact was in a state at a time; until then in the one before."""
-        if self._before is not None:
-            known = {each.value: name for each, name in FIELD_OF.items()}
-            before, since_ns = self._before
-            if before in known and time_ns > since_ns:
-                self._spent_ns[known[before]] += time_ns - since_ns
-        self._before = state, time_ns
+        with self._lock:
+            if self._before is not None:
+                known = {each.value: name for each, name in FIELD_OF.items()}
+                before, since_ns = self._before
+                if before in known and time_ns > since_ns:
+                    self._spent_ns[known[before]] += time_ns - since_ns
+            self._before = state, time_ns
 
     @property
     def fields(self) -> dict[str, float]:

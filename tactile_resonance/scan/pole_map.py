@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -41,10 +44,12 @@ def colours(share: npt.ArrayLike) -> FloatArray:
     return np.asarray(low + np.asarray(share, float)[..., None] * (high - low))
 
 
+_Cell = tuple[str | float, ...]  # frame, and three whole numbers
 SAME_PLACE_M = 1e-4
 LONE_SPACING_M = 0.005
 """What a single point is taken to be apart from others where it is drawn [m]."""
-_SEGMENTS = 36  # of an ellipse
+_SEGMENTS, _LEAST_SEGMENTS = 36, 8  # of an ellipse: where there are many, each is a few pixels wide
+_MOST_SEGMENTS = 36_000  # of all together, as far as the least allow
 _CELLS = 80  # of the raster of a boundary, along its longer side
 
 
@@ -118,34 +123,6 @@ class PoleMap:
 
     points: tuple[MapPoint, ...] = ()
 
-    def with_point(self, point: MapPoint) -> PoleMap:
-        """The same with one point more; it replaces what its own measurement or place had before."""
-        rest = self.without(point.result).points
-        own = point.result.measurement_id  # 0: it came to no measurement
-        kept = (p for p in rest if not own or p.result.measurement_id != own)
-        return replace(self, points=(*kept, point))
-
-    def with_result(self, result: PointResult) -> PoleMap:
-        """The same after one attempt at a point of a scan; one in free air or discarded changes nothing."""
-        if result.kind is not PointKind.TISSUE or result.outcome is PointOutcome.DISCARDED:
-            return self
-        if result.outcome is PointOutcome.SKIPPED:
-            return self.without(result)
-        return self.with_point(MapPoint.planned(result))
-
-    def without(self, result: PointResult) -> PoleMap:
-        """The same with nothing at the place of a result."""
-
-        def elsewhere(other: PointResult) -> bool:
-            if other.frame_id != result.frame_id:
-                return True
-            apart_m = math.hypot(
-                other.x_m - result.x_m, other.y_m - result.y_m, other.z_m - result.z_m
-            )
-            return apart_m > SAME_PLACE_M
-
-        return replace(self, points=tuple(p for p in self.points if elsewhere(p.result)))
-
     @cached_property
     def estimated(self) -> tuple[MapPoint, ...]:
         """Points with a pole."""
@@ -204,21 +181,23 @@ class PoleMap:
         A pole's plane is not space: the ellipse is drawn about the point in the plane that touches the
         surface, deviations of f0 along the frame's x axis (its projection), those of the damping ratio
         across it, at the scale given. Points come in the order of `estimated`; those without a covariance
-        are left out.
+        are left out. Ends of the lines are on the ellipse: 36 of them, fewer where there are more than a
+        thousand points, 8 at least.
         """
-        angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
+        points = self.with_ellipse
+        segments = int(np.clip(_MOST_SEGMENTS // max(len(points), 1), _LEAST_SEGMENTS, _SEGMENTS))
+        angle = np.linspace(0, 2 * np.pi, segments + 1)
         circle = _radius(probability) * np.stack(
             [np.cos(angle), np.sin(angle)]
         )  # (2, segments + 1)
         stretch = np.array([scale.m_per_hz, scale.m_per_damping])
-        lines = []
-        for point in self.with_ellipse:
-            covariance = point.result.covariance * np.outer(stretch, stretch)
-            values, vectors = np.linalg.eigh(covariance)
-            flat = vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
-            loop = point.position_m + flat.T @ tangent_axes(point.normal)  # (segments + 1, 3)
-            lines.append(np.stack([loop[:-1], loop[1:]], axis=1))
-        return np.array(lines).reshape(-1, _SEGMENTS, 2, 3)
+        covariances = np.array([p.result.covariance for p in points]).reshape(-1, 2, 2)
+        values, vectors = np.linalg.eigh(covariances * np.outer(stretch, stretch))
+        flat = vectors @ (np.sqrt(np.maximum(values, 0))[..., None] * circle)
+        axes = tangent_axes(np.array([p.normal for p in points]).reshape(-1, 3))
+        centres = np.array([p.position_m for p in points]).reshape(-1, 1, 3)
+        loops = centres + flat.swapaxes(-1, -2) @ axes  # (e, segments + 1, 3)
+        return np.stack([loops[:, :-1], loops[:, 1:]], axis=2)
 
     @cached_property
     def with_ellipse(self) -> tuple[MapPoint, ...]:
@@ -267,19 +246,96 @@ class PoleMap:
         return MapSurface(np.concatenate([xy, z[..., None]], axis=-1), value, std)
 
 
+class GrowingMap:
+    """A map while its points come; what one of them costs does not depend on how many there are."""
+
+    def __init__(self, results: Iterable[PointResult] = ()) -> None:
+        self._points: dict[int, MapPoint] = {}  # by number, in the order in which they came
+        self._at: defaultdict[_Cell, list[int]] = defaultdict(list)  # numbers by place
+        self._of_measurement: dict[int, int] = {}
+        self._numbers = itertools.count()
+        self._map: PoleMap | None = None
+        for result in results:
+            self.take(result)
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    @property
+    def map(self) -> PoleMap:
+        """As it is now."""
+        if self._map is None:
+            self._map = PoleMap(tuple(self._points.values()))
+        return self._map
+
+    def add(self, point: MapPoint) -> None:
+        """Take a point; it replaces what its own measurement or place had before."""
+        self.clear(point.result)
+        own, number = point.result.measurement_id, next(self._numbers)
+        if own:  # 0: it came to no measurement
+            if own in self._of_measurement:
+                self._remove(self._of_measurement[own])
+            self._of_measurement[own] = number
+        self._points[number] = point
+        self._at[_cell(point.result)].append(number)
+        self._map = None
+
+    def take(self, result: PointResult) -> None:
+        """Take one attempt at a point of a scan; one that does not count changes nothing."""
+        if not counts(result):
+            return
+        if result.outcome is PointOutcome.SKIPPED:
+            self.clear(result)
+        else:
+            self.add(MapPoint.planned(result))
+
+    def clear(self, result: PointResult) -> None:
+        """Leave nothing at the place of a result."""
+        frame_id, *cell = _cell(result)
+        place = result.x_m, result.y_m, result.z_m
+        for step in itertools.product((-1, 0, 1), repeat=3):
+            near = (frame_id, *(k + one for k, one in zip(cell, step, strict=True)))
+            for number in tuple(self._at.get(near, ())):
+                other = self._points[number].result
+                if math.dist(place, (other.x_m, other.y_m, other.z_m)) <= SAME_PLACE_M:
+                    self._remove(number)
+
+    def _remove(self, number: int) -> None:
+        result = self._points.pop(number).result
+        at = self._at[_cell(result)]
+        at.remove(number)
+        if not at:
+            del self._at[_cell(result)]
+        if self._of_measurement.get(result.measurement_id) == number:
+            del self._of_measurement[result.measurement_id]
+        self._map = None
+
+
+def counts(result: PointResult) -> bool:
+    """Whether an attempt at a point changes a map: one in free air or discarded does not."""
+    return result.kind is PointKind.TISSUE and result.outcome is not PointOutcome.DISCARDED
+
+
+def _cell(result: PointResult) -> _Cell:
+    """Frame and cell of a place, the cells as wide as a place is; nothing is near one that is not known."""
+    place = result.x_m, result.y_m, result.z_m
+    known = all(map(math.isfinite, place))
+    return (result.frame_id, *(math.floor(x / SAME_PLACE_M) if known else math.nan for x in place))
+
+
 def _on_a_line(xy_m: FloatArray) -> bool:
     """Whether (n, 2) positions are on one line: nothing is known beside it."""
     return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), tol=SAME_PLACE_M) < 2)
 
 
 def tangent_axes(normal: FloatArray) -> FloatArray:
-    """(2, 3) axes of the plane across a normal (3,): the projection of x, and across it."""
-    if not np.all(np.isfinite(normal)):
-        normal = np.array([0.0, 0.0, 1.0])
-    start = np.eye(3)[0 if abs(normal[0]) < 0.9 else 1]
-    first = start - (start @ normal) * normal
-    first = first / np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)])
+    """(..., 2, 3) axes of the planes across normals (..., 3): the projection of x, and across it."""
+    known = np.all(np.isfinite(normal), axis=-1, keepdims=True)
+    normal = np.where(known, normal, [0.0, 0.0, 1.0])
+    start = np.eye(3)[np.where(np.abs(normal[..., 0]) < 0.9, 0, 1)]
+    first = start - np.sum(start * normal, axis=-1, keepdims=True) * normal
+    first = first / np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(normal, first)], axis=-2)
 
 
 def _radius(probability: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -41,18 +41,18 @@ class ResultsFile:
         self._path, self._last = folder / RESULTS, -1
         self._write(results)
 
-    def add(self, result: PointResult, latest: Sequence[PointResult]) -> None:
+    def add(self, result: PointResult, latest: Callable[[], Sequence[PointResult]]) -> None:
         """Take in one result more.
 
         Parameters
         ----------
         result : PointResult
-        latest : sequence of PointResult
-            Of all points, by index, with this one.
+        latest : callable
+            Returns those of all points, by index, with this one; asked where all rows are written.
         """
         wider = len(result.further) > self._further or len(result.distortion) > self._distortion
         if wider or result.index <= self._last or not self._path.exists():
-            self._write(latest)
+            self._write(latest())
             return
         with self._path.open("a", encoding="utf-8", newline="") as file:
             file.write(_rows([_row(result, self._further, self._distortion)]))

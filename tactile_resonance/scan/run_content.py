@@ -22,7 +22,7 @@ from tactile_resonance.scan.scan_point import ScanPoint
 NOT_CHECKED = "{} files are not checked for damage: an earlier version recorded them"
 FORMAT = "tactile_resonance run 1"
 RECORDING, SCENE = "recording", "scene.yaml"
-_POINT = re.compile(r"point-(\d{5})-(\d{2,})\.mcap")
+POINT_FILE = re.compile(r"point-(\d{5})-(\d{2,})\.mcap")
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,6 @@ class RunContent:
         names = {result.index: file_of(self.path, result).name for result in self.latest}
         return {index: counts[name] for index, name in names.items() if counts[name]}
 
-    def with_file(self, file: FileContent, result: PointResult | None) -> RunContent:
-        """The same with one finished file more."""
-        results = self.results if result is None else _in_order((*self.results, result))
-        return replace(self, files=(*self.files, file), results=results)
-
 
 def file_of(run: Path, result: PointResult) -> Path:
     """File of one attempt at a point."""
@@ -133,7 +128,7 @@ def read_run(path: Path) -> RunContent:
     return replace(
         run,
         files=tuple(files),
-        results=_in_order(results),
+        results=in_order(results),
         problems=tuple(problems),
         unchecked=sum(f"{RECORDING}/{file.name}" not in entries for file in files),
     )
@@ -161,13 +156,14 @@ def _checked(
         result = None if entry is None else entry.result
         if entry is None or result is None:
             return *_read_file(path, len(run.points)), ""
-        match = _POINT.fullmatch(path.name)
+        match = POINT_FILE.fullmatch(path.name)
         return entry.content, None if match is None else _named(result, match, len(run.points)), ""
     except (OSError, ValueError) as error:
         return None, None, str(error)
 
 
-def _in_order(results: Iterable[PointResult]) -> tuple[PointResult, ...]:
+def in_order(results: Iterable[PointResult]) -> tuple[PointResult, ...]:
+    """By point and attempt."""
     return tuple(sorted(results, key=lambda result: (result.index, result.attempt)))
 
 
@@ -201,7 +197,7 @@ def read_plan(path: Path) -> RunContent:
 
 
 def _read_file(path: Path, points: int) -> tuple[FileContent, PointResult | None]:
-    match = _POINT.fullmatch(path.name)
+    match = POINT_FILE.fullmatch(path.name)
     if match is None:
         if not re.fullmatch(r"reference-.*\.mcap", path.name):
             raise ValueError(f"{path.name}: neither of a point nor a reference")

@@ -26,6 +26,7 @@ import json
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +53,15 @@ from tactile_resonance.scan.point_result import (
     serialised,
 )
 from tactile_resonance.scan.results_file import ResultsFile
-from tactile_resonance.scan.run_content import FORMAT, RECORDING, SCENE, RunContent, read_run
+from tactile_resonance.scan.run_content import (
+    FORMAT,
+    POINT_FILE,
+    RECORDING,
+    SCENE,
+    RunContent,
+    in_order,
+    read_run,
+)
 from tactile_resonance.scan.run_index import (
     INDEX,
     append_entry,
@@ -74,18 +83,31 @@ class RunDirectory:
 
     Made by `create` or `open`; a context that gives the folder free again.
 
+    What a point costs here does not depend on how many are finished.
+
     Attributes
     ----------
     path : Path
-    content : RunContent
-        As far as it has come.
+    repeats : int
+        Of all attempts that are kept.
     """
 
     def __init__(self, path: Path, lock: int, content: RunContent) -> None:
         self.path = path
-        self.content = content
         self._lock = lock
-        self._results = ResultsFile(path, content.latest)
+        self._opened = content
+        self._points, self._files = list(content.points), list(content.files)
+        self._results = list(content.results)
+        self._latest = {result.index: result for result in content.latest}
+        self.repeats = sum(result.repeats for result in content.results)
+        self._next = 0  # all points before this one are finished
+        # damaged files keep their names: their attempt is not given twice
+        self._attempts = Counter[int]()
+        for name in os.listdir(path / RECORDING):
+            if match := POINT_FILE.fullmatch(name):
+                index, attempt = map(int, match.groups())
+                self._attempts[index] = max(self._attempts[index], attempt + 1)
+        self._results_file = ResultsFile(path, content.latest)
         self._write_metadata()
 
     @classmethod
@@ -197,28 +219,51 @@ class RunDirectory:
     def close(self) -> None:
         """Complete the summaries, where the disk takes them, and give the folder free."""
         if self._lock >= 0:
-            if self._listed < len(self.content.files):
+            if self._listed < len(self._files):
                 with contextlib.suppress(OSError):  # `open` makes them anew
                     self._write_metadata()
             os.close(self._lock)
             self._lock = -1
 
+    @property
+    def content(self) -> RunContent:
+        """The run as far as it has come; put together at each call."""
+        return replace(
+            self._opened,
+            points=tuple(self._points),
+            files=tuple(self._files),
+            results=in_order(self._results),
+        )
+
+    @property
+    def finished(self) -> int:
+        """Number of points that are."""
+        return len(self._latest)
+
+    @property
+    def next_point(self) -> ScanPoint | None:
+        """As `RunContent.next_point`."""
+        while self._next < len(self._points):
+            point = self._points[self._next]
+            if point.index not in self._latest:
+                return point
+            self._next += 1
+        return None
+
     def append(self, point: ScanPoint) -> ScanPoint:
         """Add the next point of a scan that chooses them, durably; returns it."""
-        content = replace(self.content, points=(*self.content.points, point))
+        content = replace(self._opened, points=(*self._points, point))
         write_whole(self.path / "run.json", _plan_text(content))
         sync_folder(self.path)
-        self.content = content
+        self._points.append(point)
         return point
 
     def begin_point(self, index: int) -> PointRecording:
         """Begin the next attempt at a point of the plan."""
-        if not 0 <= index < len(self.content.points):
-            last = len(self.content.points) - 1
+        if not 0 <= index < len(self._points):
+            last = len(self._points) - 1
             raise ValueError(f"index: got {index!r}; accepted is 0 to {last}")
-        # damaged files keep their names: their attempt is not given twice
-        taken = list((self.path / RECORDING).glob(f"point-{index:05d}-*.mcap"))
-        attempt = 1 + max((int(path.stem.rsplit("-", 1)[1]) for path in taken), default=-1)
+        attempt = self._attempts[index]
         return PointRecording(self, f"point-{index:05d}-{attempt:02d}", index, attempt)
 
     def begin_reference(self, name: str) -> PointRecording:
@@ -229,15 +274,19 @@ class RunDirectory:
         return PointRecording(self, f"reference-{number:02d}-{name}")
 
     def _add(self, file: FileContent, result: PointResult | None) -> None:
-        self.content = self.content.with_file(file, result)
+        self._files.append(file)
         if result is not None:
-            self._results.add(result, self.content.latest)
-        if len(self.content.files) > 1.05 * self._listed:
+            self._results.append(result)
+            self._latest[result.index] = result
+            self.repeats += result.repeats
+            self._attempts[result.index] = result.attempt + 1
+            self._results_file.add(result, lambda: self.content.latest)
+        if len(self._files) > 1.05 * self._listed:
             self._write_metadata()
 
     def _write_metadata(self) -> None:
-        write_bag_metadata(self.path / RECORDING, self.content.files)
-        self._listed = len(self.content.files)
+        write_bag_metadata(self.path / RECORDING, self._files)
+        self._listed = len(self._files)
 
 
 class PointRecording:

@@ -93,7 +93,7 @@ class ScanRunner:
         self._hands, self._controls, self._tell = hands, controls, tell
         self._publish = publish
         self._seed = seed
-        self._durations_s: list[float] = []
+        self._durations_s, self._timed = 0.0, 0  # of points, and of how many
         self._disturbed: defaultdict[int, Disturbances] = defaultdict(Disturbances)
         self._air: AirReference | None = None
         self._left_s = NAN  # when the tip was free after the newest point
@@ -134,7 +134,7 @@ class ScanRunner:
         except Interrupted:
             return "cancelled"
         except OSError as error:  # the disk is full, or gone
-            safe = len(self._run.content.latest)
+            safe = self._run.finished
             reason = error.strerror or error
             return f"{self._run.path}: {reason}; {safe} points are safe in it, resume goes on"
         return ""
@@ -144,9 +144,9 @@ class ScanRunner:
         self._wait()
         point = self._known_next()
         request = self._controls.take()
-        if request is Request.REPEAT and self._run.content.results:
-            latest = max(self._run.content.results, key=lambda result: result.time_ns)
-            return self._run.content.points[latest.index]
+        if request is Request.REPEAT and (content := self._run.content).results:
+            latest = max(content.results, key=lambda result: result.time_ns)
+            return content.points[latest.index]
         if request is Request.SKIP and point is not None:
             with self._run.begin_point(point.index) as recording:
                 result = self._ended(point, recording, PointOutcome.SKIPPED, SKIPPED, 0.0)
@@ -156,9 +156,9 @@ class ScanRunner:
 
     def _known_next(self) -> ScanPoint | None:
         """The first point that is not finished; an adaptive scan chooses and appends one where all are."""
-        content = self._run.content
-        if (point := content.next_point) is not None:
+        if (point := self._run.next_point) is not None:
             return point
+        content = self._run.content
         chosen = self._plan.next_point(content.points, content.latest)
         return None if chosen is None else self._run.append(chosen)
 
@@ -267,7 +267,8 @@ class ScanRunner:
             )
             self._left_s = begun_s + duration_s
             self._publish(recording.finish(result))
-        self._durations_s.append(duration_s)
+        self._durations_s += duration_s
+        self._timed += 1
         if result.outcome is PointOutcome.FAILED and scene.on_failure is OnFailure.STOP:
             raise ScanEnded(
                 f"point {point.index + 1} failed and on_failure is stop: {result.reason}"
@@ -399,10 +400,10 @@ class ScanRunner:
         poles: Poles | None = None,
         waiting_for: str = "",
     ) -> None:
-        points, finished = self._plan.most_points, len(self._run.content.latest)
+        points, finished = self._plan.most_points, self._run.finished
         each_s = self._plan.longest_s / points
-        if self._durations_s:
-            each_s = sum(self._durations_s) / len(self._durations_s)
+        if self._timed:
+            each_s = self._durations_s / self._timed
         left_s = each_s * (points - finished)
         repeats = self._repeats()
         self._tell(
@@ -411,17 +412,16 @@ class ScanRunner:
 
     def _repeats(self) -> int:
         """Of the points that are finished and of the one under way."""
-        finished = sum(result.repeats for result in self._run.content.results)
-        return finished + sum(of_point.total for of_point in self._disturbed.values())
+        return self._run.repeats + sum(of_point.total for of_point in self._disturbed.values())
 
     def _summary(self, message: str) -> Summary:
-        latest = self._run.content.latest
-        count = {o: sum(result.outcome is o for result in latest) for o in PointOutcome}
         content = self._run.content
+        latest = content.latest
+        count = {o: sum(result.outcome is o for result in latest) for o in PointOutcome}
         left = content.next_point or self._plan.next_point(content.points, latest)
-        health, sentence = sensor_health(self._run.content, self._scene.drift_limits)
+        health, sentence = sensor_health(content, self._scene.drift_limits)
         message = message or ("ended early" if left else "complete")
-        if problems := self._run.content.problems:
+        if problems := content.problems:
             message += f"; {len(problems)} damaged files left out, the first: {problems[0]}"
         return Summary(
             complete=left is None,

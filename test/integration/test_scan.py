@@ -86,6 +86,15 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
             msg.PointResult, "point_result", told.append, POINT_RESULTS
         )
         client.wait(lambda: len(told) == 6, HANGS_S, "all results")
+        done = {r.measurement_id for r in told if r.outcome == PointOutcome.DONE}
+        records = tmp_path / "records"
+        client.wait(
+            lambda: done.isdisjoint(int(path.name.split("-")[1]) for path in records.iterdir()),
+            HANGS_S,
+            "records that are in the run to be removed beside it",
+        )
+        (silent,) = (r.measurement_id for r in told if r.outcome != PointOutcome.DONE)
+        assert list(records.glob(f"*-{silent}"))  # its result does not vouch for its records
     assert result.ending is Ending.COMPLETE, result.message
     assert (result.done, result.failed, result.skipped) == (3, 0, 0)
     run = read_run(run_path)

@@ -220,6 +220,31 @@ def test_a_measurement_is_never_overwritten(tmp_path):
         RecordStore(tmp_path).add_record(stores.record(stores.excitations(8)[0], 0))
 
 
+def test_what_is_safe_elsewhere_is_removed_and_nothing_else(tmp_path):
+    stores.write(RecordStore(tmp_path), 6)
+    store = RecordStore(tmp_path)
+    for key in (7, 8, 9):
+        stores.write(store, key)
+    for key in (6, 8, 9, 9, 1234):  # 6 is from an earlier session, 1234 nobody's
+        store.remove(key)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000001-6", "000002-7"]
+    with pytest.raises(ValueError, match="measurement_id: 9 is in .* already"):
+        store.begin(stores.excitations(9))
+    stores.write(store, 10)
+    assert [m.measurement_id for m in read_store(tmp_path).measurements] == [6, 7, 10]
+    assert sorted(path.name for path in tmp_path.iterdir())[-1] == "000005-10"
+
+
+def test_a_measurement_costs_the_same_however_many_a_store_has_had(tmp_path, monkeypatch):
+    looked = []
+    listed = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda path: looked.append(path) or listed(path))
+    store = RecordStore(tmp_path / "store")
+    for key in range(1, 30):
+        store.begin(stores.excitations(key))
+    assert len(looked) == 1
+
+
 def test_a_failed_write_leaves_nothing_that_looks_whole(tmp_path, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")

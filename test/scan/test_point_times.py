@@ -3,6 +3,7 @@
 
 import csv
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,6 +56,27 @@ def test_times_of_states_are_those_between_their_beginnings():
     times.begin()
     times.take("travel", round(10e9))
     assert times.fields == {}
+
+
+def test_states_may_come_while_another_contact_begins():
+    times, over = StateTimes(), threading.Event()
+
+    def begin_again_and_again():
+        while not over.is_set():
+            times.begin()
+
+    beside = threading.Thread(target=begin_again_and_again)
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    beside.start()
+    try:
+        for k in range(30_000):
+            times.take("hold", k)
+    finally:
+        over.set()
+        beside.join()
+        sys.setswitchinterval(interval_s)
+    assert set(times.fields) <= set(SPENT)
 
 
 def test_parts_of_the_time_add_up_to_the_points_and_the_time_between_them():

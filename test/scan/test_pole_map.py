@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map: which mode, which place, and where its ellipses lie."""
 
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,13 @@ from tactile_resonance.scan.messages import header_message
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result, with_poles
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.pole_map import EllipseScale, MapPoint, PoleMap
+from tactile_resonance.scan.pole_map import (
+    SAME_PLACE_M,
+    EllipseScale,
+    GrowingMap,
+    MapPoint,
+    PoleMap,
+)
 from tactile_resonance.scan.results_file import as_csv
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
 from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalContact
@@ -94,13 +101,13 @@ def origin(x=0.0, y=0.0, z=0.0, key=1, normal=(0.0, 0.0, 1.0)):
 
 
 def grid_map(count=5, spacing=0.004, f0=lambda x, y: 250 + 300 * x, **values):
-    result = PoleMap()
+    result = GrowingMap()
     for i in range(count):
         for j in range(count):
             x, y = spacing * i, spacing * j
             point = map_point(poles((f0(x, y),), **values), origin(x, y, key=1 + count * i + j))
-            result = result.with_point(point)
-    return result
+            result.add(point)
+    return result.map
 
 
 def test_a_point_takes_the_strongest_mode_and_the_fullest_covariance():
@@ -141,7 +148,9 @@ def test_tissue_is_called_at_the_nominal_contact_and_the_measured_pole_is_shown(
     np.testing.assert_allclose(found.covariance, COVARIANCE, rtol=1e-14)
     assert found.nominal_f0_std_hz**2 > COVARIANCE[0, 0] + (1000 * 1e-4) ** 2
     # a force that is known to 1 mN only makes 1 Hz
-    unsure = [map_point(poles((252.0,)), pressed(0.01, std), **given).result for std in (1e-4, 1e-3)]
+    unsure = [
+        map_point(poles((252.0,)), pressed(0.01, std), **given).result for std in (1e-4, 1e-3)
+    ]
     assert [point.tissue_class for point in unsure] == [UNKNOWN, "soft"]
     unknown = map_point(poles((250.0,)), pressed(np.nan, np.nan), **given).result
     assert unknown.tissue_class == UNKNOWN
@@ -150,25 +159,59 @@ def test_tissue_is_called_at_the_nominal_contact_and_the_measured_pole_is_shown(
     np.testing.assert_array_equal(unknown.estimate, [250.0, 0.03])
 
 
+def grown(*points):
+    found = GrowingMap()
+    for point in points:
+        found.add(point)
+    return found
+
+
+def test_a_map_holds_what_a_search_of_all_its_points_would_leave():
+    random, found, wanted = np.random.default_rng(4), GrowingMap(), []
+    taken = replace(map_point(poles((250.0,)), origin(key=1)).result, measurement_id=0)
+    places = random.integers(-3, 4, (400, 3)) * 7e-5  # of neighbours one or two are within 1e-4
+    for k, place in enumerate(np.vstack([places, np.full((2, 3), np.nan)])):
+        x_m, y_m, z_m = place
+        key, kind = int(random.integers(4) and 1 + random.integers(60)), random.integers(5)
+        outcome = PointOutcome.SKIPPED if kind == 0 else PointOutcome.DONE
+        frame = "phantom" if kind == 1 else "table"
+        result = replace(taken, x_m=x_m, y_m=y_m, z_m=z_m, measurement_id=key)
+        result = replace(result, outcome=outcome, frame_id=frame, time_ns=k)
+        found.take(result)
+        wanted = [
+            other
+            for other in wanted
+            if other.frame_id != frame
+            or not math.dist((other.x_m, other.y_m, other.z_m), place) <= SAME_PLACE_M
+        ]
+        if outcome is PointOutcome.DONE:
+            wanted = [other for other in wanted if not key or other.measurement_id != key]
+            wanted.append(result)
+        assert [point.result.time_ns for point in found.map.points] == [r.time_ns for r in wanted]
+    assert len(found) == len(wanted) > 20
+
+
 def test_each_place_once_whatever_comes():
     block_1 = map_point(poles((250.0,)), origin(key=7))
     block_2 = map_point(poles((250.5,)), origin(x=0.00002, key=7))
     repeated = map_point(poles((251.0,)), origin(y=0.00005, key=8))
     elsewhere = map_point(poles((252.0,)), origin(x=0.004, key=9))
-    found = PoleMap().with_point(block_1).with_point(block_2)
-    assert [p.result.f0_hz for p in found.points] == [250.5]
-    found = found.with_point(repeated).with_point(elsewhere)
-    assert [p.result.f0_hz for p in found.points] == [251.0, 252.0]
+    found = grown(block_1, block_2)
+    assert found.map.f0_hz.tolist() == [250.5]
+    found.add(repeated)
+    found.add(elsewhere)
+    assert found.map.f0_hz.tolist() == [251.0, 252.0]
 
 
 def test_the_same_numbers_in_two_frames_are_two_places():
-    shown = PoleMap()
+    shown = GrowingMap()
     for key, frame in enumerate(("table", "phantom", "phantom"), 1):
         point = map_point(poles((250.0 + key,)), origin(x=0.1 * key, key=key))
         result = replace(point.result, x_m=0.0, y_m=0.0, z_m=0.0, frame_id=frame)
-        shown = shown.with_point(replace(point, result=result))
-    assert shown.f0_hz.tolist() == [251.0, 253.0]
-    assert shown.without(result).f0_hz.tolist() == [251.0]
+        shown.add(replace(point, result=result))
+    assert shown.map.f0_hz.tolist() == [251.0, 253.0]
+    shown.clear(result)
+    assert shown.map.f0_hz.tolist() == [251.0]
 
 
 def test_no_pose_is_refused_and_no_pole_is_a_failure():
@@ -176,7 +219,7 @@ def test_no_pose_is_refused_and_no_pole_is_a_failure():
         map_point(poles(), Origin(measurement_id=3))
     failed = map_point(Poles(status=PolesStatus.NO_RESONANCE, message="none in band"), origin())
     elsewhere = replace(failed.result, measurement_id=99, x_m=1.0)
-    found = grid_map(2).with_point(MapPoint.planned(elsewhere))
+    found = PoleMap((*grid_map(2).points, MapPoint.planned(elsewhere)))
     assert failed.result.failed
     assert (len(found.estimated), len(found.failures)) == (4, 1)
     assert found.failures[0].result.reason == "none in band"
@@ -228,11 +271,21 @@ def test_the_scale_keeps_ellipses_apart_in_round_numbers():
     assert PoleMap((bare,)).ellipses(EllipseScale(1, 1)).shape == (0, 36, 2, 3)
 
 
+def test_corners_of_many_small_ellipses_are_fewer_and_lie_on_them():
+    (point,) = grid_map(1).points
+    for count, segments in ((1, 36), (1000, 36), (2000, 18), (10_000, 8)):
+        lines = PoleMap((point,) * count).ellipses(EllipseScale(1.0, 1.0), 0.95)
+        assert lines.shape == (count, segments, 2, 3)
+        offset = (lines[-1] - point.position_m)[..., :2].reshape(-1, 2)
+        squared = np.sum(offset * np.linalg.solve(point.result.covariance, offset.T).T, axis=1)
+        np.testing.assert_allclose(squared, chi2.ppf(0.95, 2), rtol=1e-9)
+
+
 def test_what_is_drawn_refers_to_the_size_seen_from_above():
     row = PoleMap(tuple(p for p in grid_map().points if p.position_m[1] == 0))
     assert row.size_m == pytest.approx(0.016)
     in_air = map_point(poles(), origin(0.0, 0.0, 0.06, key=99))
-    assert row.with_point(in_air).size_m == pytest.approx(0.016)
+    assert PoleMap((*row.points, in_air)).size_m == pytest.approx(0.016)
     assert PoleMap(row.points[:2]).size_m == pytest.approx(4 * 0.004)
     assert PoleMap(row.points[:1]).size_m == pytest.approx(4 * 0.005)
 
@@ -286,14 +339,13 @@ def test_a_run_s_results_make_the_same_point():
         f0_damping_covariance_hz=COVARIANCE[0, 1],
         poles_status="model error",
     )
-    again = PoleMap().with_result(result)
+    again = GrowingMap([result]).map
     (found,) = again.estimated
     np.testing.assert_allclose(found.result.covariance, point.result.covariance)
     np.testing.assert_allclose(found.position_m, point.position_m)
     cloud = cloud_message(again, (), header_message("table", 1))
     (row,) = np.frombuffer(cloud.data.tobytes(), POINT)
     assert row["status"] == POLES_STATUS[PolesStatus.MODEL_ERROR]
-    (failed,) = again.with_result(
-        replace(result, outcome=PointOutcome.FAILED, reason="contact lost")
-    ).failures
+    lost = replace(result, outcome=PointOutcome.FAILED, reason="contact lost")
+    (failed,) = GrowingMap([result, lost]).map.failures
     assert failed.result.reason == "contact lost"
