@@ -44,7 +44,7 @@ def colours(share: npt.ArrayLike) -> FloatArray:
     return np.asarray(low + np.asarray(share, float)[..., None] * (high - low))
 
 
-_Cell = tuple[str | float, ...]  # frame, and three whole numbers
+_Cell = tuple[str, tuple[float, ...]]  # frame, and three whole numbers
 SAME_PLACE_M = 1e-4
 LONE_SPACING_M = 0.005
 """What a single point is taken to be apart from others where it is drawn [m]."""
@@ -291,11 +291,11 @@ class GrowingMap:
 
     def clear(self, result: PointResult) -> None:
         """Leave nothing at the place of a result."""
-        frame_id, *cell = _cell(result)
+        frame_id, cell = _cell(result)
         place = result.x_m, result.y_m, result.z_m
         for step in itertools.product((-1, 0, 1), repeat=3):
-            near = (frame_id, *(k + one for k, one in zip(cell, step, strict=True)))
-            for number in tuple(self._at.get(near, ())):
+            near = tuple(k + one for k, one in zip(cell, step, strict=True))
+            for number in tuple(self._at.get((frame_id, near), ())):
                 other = self._points[number].result
                 if math.dist(place, (other.x_m, other.y_m, other.z_m)) <= SAME_PLACE_M:
                     self._remove(number)
@@ -320,7 +320,7 @@ def _cell(result: PointResult) -> _Cell:
     """Frame and cell of a place, the cells as wide as a place is; nothing is near one that is not known."""
     place = result.x_m, result.y_m, result.z_m
     known = all(map(math.isfinite, place))
-    return (result.frame_id, *(math.floor(x / SAME_PLACE_M) if known else math.nan for x in place))
+    return result.frame_id, tuple(math.floor(x / SAME_PLACE_M) if known else math.nan for x in place)
 
 
 def _on_a_line(xy_m: FloatArray) -> bool:
