@@ -78,43 +78,65 @@ class KilledScan:
         Of the grid that is scanned.
     robot_host : str
         127.x.y.z of a simulated robot with load cell; empty: ideal contact. Either in simulated time.
+    prefix : sequence of str
+        Before the command of each node: see `NodeProcesses`.
+
+    Attributes
+    ----------
+    processes : NodeProcesses
+    client : ScanClient
+    parameters : dict
+        Of each node, to be changed before the context is entered.
+    run : Path
+        Folder of the scan under way.
+    result : Future
+        Its outcome.
+    phase, finished, waiting_for, repeats
+        What its feedback has told last.
     """
 
-    def __init__(self, folder: Path, points: tuple[int, int], robot_host: str = "") -> None:
-        self._folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        points: tuple[int, int],
+        robot_host: str = "",
+        prefix: Sequence[str] = (),
+    ) -> None:
+        self._folder, self._prefix = folder, prefix
         self._points = points[0] * points[1]
         scene = folder / "scene.yaml"
         size = [0.003 * (n - 1) for n in points]
         scene.write_text(SCENE.format(size_x=size[0], size_y=size[1], blocks=BLOCKS))
-        self._scene = scene
+        self.scene = scene
         self.nodes = (*STREAM, *(["contact_node"] if robot_host else []), *OTHERS)
-        self._parameters = node_parameters(Job(scene, folder, robot_host or HOST), False, folder)
-        self._parameters[MANAGER] = {"nodes": f"[{','.join(self.nodes)}]"}
+        self.parameters = node_parameters(Job(scene, folder, robot_host or HOST), False, folder)
+        self.parameters[MANAGER] = {"nodes": f"[{','.join(self.nodes)}]"}
         if not robot_host:
-            without_robot(self._parameters)
+            without_robot(self.parameters)
         self._known: dict[str, Finished] = {}
-        self._run = folder / "run-0"
+        self.run = folder / "run-0"
         self._runs = 0
-        self._phase, self._finished, self._heard = "", 0, False
+        self.phase, self.finished, self._heard = "", 0, False
+        self.waiting_for, self.repeats = "", 0
         self.kills: list[Kill] = []
 
     def __enter__(self) -> KilledScan:
         from tactile_resonance.nodes.client import ScanClient
 
-        self._processes = NodeProcesses(self._folder / "log")
-        self._client = ScanClient(self._processes.check)
-        self._client.__enter__()
-        self._start((*self.nodes, MANAGER))
+        self.processes = NodeProcesses(self._folder / "log", self._prefix)
+        self.client = ScanClient(self.processes.check)
+        self.client.__enter__()
+        self.start((*self.nodes, MANAGER))
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._processes.stop()
-        self._client.__exit__()
+        self.processes.stop()
+        self.client.__exit__()
 
     def undisturbed(self) -> dict[int, tuple[float, ...]]:
         """Poles by point of a scan from beginning to end."""
-        self._begin()
-        return self._to_the_end()
+        self.begin()
+        return self.to_the_end()
 
     def disturbed(
         self, victims: Sequence[str], random: np.random.Generator, longest_s: float = float("inf")
@@ -128,82 +150,84 @@ class KilledScan:
         """
         scans = []
         over_s = time.monotonic() + longest_s
-        self._begin()
+        self.begin()
         for victim in victims:
             if time.monotonic() > over_s:
                 break
             # every other time the scan may first finish a point; else it is met again while it recovers
-            wanted = self._finished + int(random.integers(2))
+            wanted = self.finished + int(random.integers(2))
             wait_s = float(random.uniform(0.0, LONGEST_WAIT_S))
             end_s = time.monotonic() + wait_s
             while time.monotonic() < end_s:
-                self._client.spin(0.02)
-                if self._result.done():
-                    scans.append(self._to_the_end())
-                    self._begin()
+                self.client.spin(0.02)
+                if self.result.done():
+                    scans.append(self.to_the_end())
+                    self.begin()
                     wanted = 0
-                if self._finished < wanted:
+                if self.finished < wanted:
                     end_s = time.monotonic() + wait_s
-            self._kill(victim)
-        scans.append(self._to_the_end())
+            self.kill(victim)
+        scans.append(self.to_the_end())
         return scans
 
-    def _kill(self, victim: str) -> None:
+    def kill(self, victim: str) -> None:
         killed = (*self.nodes, MANAGER) if victim == ALL else (victim,)
-        self._processes.kill(*killed)
-        found = self._look()
-        hidden = self._run / ".unfinished"
+        self.processes.kill(*killed)
+        found = self.look()
+        hidden = self.run / ".unfinished"
         midst = hidden.is_dir() and any(hidden.iterdir())
-        self.kills.append(Kill(victim, len(found), midst, self._phase))
+        self.kills.append(Kill(victim, len(found), midst, self.phase))
         print(f"kill {len(self.kills)}: {self.kills[-1]}", file=sys.stderr, flush=True)
-        self._start(killed)
+        self.start(killed)
         if "scan_node" in killed:
-            self._ask(resume=True)
+            self.ask(resume=True)
 
-    def _start(self, nodes: Sequence[str]) -> None:
+    def start(self, nodes: Sequence[str]) -> None:
         for _ in range(10):  # what those that were killed had told
-            self._client.spin(0.02)
-        states = self._client.states
+            self.client.spin(0.02)
+        states = self.client.states
         states.clear()
         for node in nodes:
-            self._processes.start(node, self._parameters.get(node))
+            self.processes.start(node, self.parameters.get(node))
 
         def up() -> bool:
             # each tells of itself: the manager may not have noticed yet that one was away
             return all(states.get(node, "").startswith("active") for node in (*nodes, MANAGER))
 
-        self._client.wait(up, UP_WITHIN_S, "the nodes to come up")
+        self.client.wait(up, UP_WITHIN_S, "the nodes to come up")
 
-    def _begin(self) -> None:
-        self._run = self._folder / f"run-{self._runs}"
+    def begin(self) -> None:
+        self.run = self._folder / f"run-{self._runs}"
         self._runs += 1
-        self._known, self._finished = {}, 0
-        self._ask(resume=False)
+        self._known, self.finished = {}, 0
+        self.waiting_for, self.repeats = "", 0
+        self.ask(resume=False)
 
-    def _ask(self, *, resume: bool) -> None:
+    def ask(self, *, resume: bool) -> None:
         # a scan that was killed before it had a folder cannot be resumed
-        goal: dict[str, Any] = {"scene": self._scene}
+        goal: dict[str, Any] = {"scene": self.scene}
         if resume:
             self._heard = False
 
             def known() -> bool:
-                return self._heard or self._result.done()
+                return self._heard or self.result.done()
 
-            self._client.wait(known, LOST_WITHIN_S, "the fate of the scan")
+            self.client.wait(known, LOST_WITHIN_S, "the fate of the scan")
             if self._heard:  # its goal was not accepted before the kill, and is now
                 return
-            if (self._run / "run.json").exists():
+            if (self.run / "run.json").exists():
                 goal = {"resume": True}
-        scan = self._client.tactile.scan
-        self._result = scan(**goal, run_directory=self._run, on_feedback=self._hear)
+        scan = self.client.tactile.scan
+        self.result = scan(**goal, run_directory=self.run, on_feedback=self._hear)
 
     def _hear(self, feedback) -> None:
         self._heard = True
-        self._phase, self._finished = feedback.phase, feedback.finished
+        self.phase, self.finished = feedback.phase, feedback.finished
+        self.waiting_for, self.repeats = feedback.waiting_for or self.waiting_for, feedback.repeats
 
-    def _look(self) -> dict[str, Finished]:
+    def look(self) -> dict[str, Finished]:
         """Every finished file, readable to its end, none of them lost, changed or repeated."""
-        found = finished_points(self._run / "recording")
+        found = finished_points(self.run / "recording")
         for name, before in self._known.items():
             assert found.get(name) == before, f"{name} was finished and is lost or changed"
         twice = [i for i, n in Counter(point.index for point in found.values()).items() if n > 1]
@@ -211,18 +235,18 @@ class KilledScan:
         self._known = found
         return found
 
-    def _to_the_end(self) -> dict[int, tuple[float, ...]]:
+    def to_the_end(self) -> dict[int, tuple[float, ...]]:
         from tactile_resonance.client import Ending
 
-        self._client.wait(self._result.done, SCAN_WITHIN_S, "the scan")
-        result = self._result.result()
+        self.client.wait(self.result.done, SCAN_WITHIN_S, "the scan")
+        result = self.result.result()
         assert result.ending is Ending.COMPLETE, result.message
         assert (result.done, result.failed, result.skipped) == (self._points, 0, 0), result.message
-        found = self._look()
+        found = self.look()
         assert sorted(point.index for point in found.values()) == list(range(self._points))
         for name, point in found.items():
             assert point.counts == (BLOCKS, BLOCKS, BLOCKS), f"{name}: {point.counts}"
         if "contact_node" in self.nodes:  # without a robot nobody lifts the tip into free air
-            references = sorted(path.stem[13:] for path in self._run.glob("recording/reference-*"))
+            references = sorted(path.stem[13:] for path in self.run.glob("recording/reference-*"))
             assert references == ["air-after", "air-before"], references
         return {point.index: point.poles for point in found.values()}

@@ -50,8 +50,9 @@ def finished_points(recording: Path) -> dict[str, Finished]:
         with AnyReader([path]) as reader:
             for connection, _, cdr in reader.messages():
                 message = reader.deserialize(cdr, connection.msgtype)
-                counts[connection.topic] += 1
-                if connection.topic == "/point_result":
+                topic = "/" + connection.topic.rpartition("/")[2]  # it may have been relayed
+                counts[topic] += 1
+                if topic == "/point_result":
                     results.append(message)
         if path.name.startswith("reference-"):
             continue

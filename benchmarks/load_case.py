@@ -262,7 +262,7 @@ class _Watch:
         while self._demo.poll() is None and not re.search(r"^[1-9]\d* of ", self.printed, re.M):
             time.sleep(0.1)
         for name in names:
-            found = [pid for pid in descendants(self._demo.pid) if _runs(pid, name)]
+            found = [pid for pid in descendants(self._demo.pid) if runs(pid, name)]
             if self._demo.poll() is not None or not found:
                 return
             self.stopped.append(name)
@@ -306,7 +306,7 @@ def _command(pid: int) -> str:
         return ""
 
 
-def _runs(pid: int, name: str) -> bool:
+def runs(pid: int, name: str) -> bool:
     """Whether a process is that node, or that command."""
     words = _command(pid).split()
     return any(word == name or word.endswith(f".{name}") for word in words)

@@ -54,15 +54,22 @@ class PlantHistory:
     Parameters
     ----------
     plant : Plant
+
+    Attributes
+    ----------
+    largest_force_n : float
+        On the tissue along its normal, since the beginning.
     """
 
     def __init__(self, plant: Plant) -> None:
         self._plant = plant
+        self.largest_force_n = 0.0
         self._steps: deque[_PlantStep] = deque(maxlen=KEEP_STEPS)
 
     def step(self) -> None:
         """Note what is true now; to be called after each step of the plant."""
         plant = self._plant
+        self.largest_force_n = max(self.largest_force_n, plant.normal_force_n)
         self._steps.append(
             _PlantStep(
                 plant.time_s,
@@ -265,7 +272,11 @@ def attach(robot: SimulatedRobot, tabletop: Tabletop) -> None:
         place_surface=tabletop.place_surface,
         move_surface=tabletop.move_surface,
         place_tissue=tabletop.place_tissue,
-        truth=lambda fields: {**tabletop.truth(fields), "stalls": robot.time.stalls},
+        truth=lambda fields: {
+            **tabletop.truth(fields),
+            "stalls": robot.time.stalls,
+            "largest_force_n": history.largest_force_n,
+        },
         history=history.since,
         contact_over=history.contact_over,
     )
