@@ -12,7 +12,7 @@ NAMES = (
     *("frf", "poles", "bench", "contact", "touch", "robot"),
     *("twist", "cell", "recording", "pipeline", "live", "load"),
     *("truth", "skip", "references", "report", "mechanics", "calibrate"),
-    *("stability", "hostile", "endurance", "overview"),
+    *("stability", "hostile", "faults", "endurance", "overview"),
 )
 WITH_FULL = ("contact", "hostile")
 """Those with a larger grid than they run by default."""
@@ -37,6 +37,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--part", choices=PARTS, help="renew this table of poles alone; default: all"
     )
     parser.add_argument(
+        "--row", metavar="TEXT", help="renew the rows of faults whose names hold this; default: all"
+    )
+    parser.add_argument(
         "--output",
         type=Path,
         default=Path("docs/benchmarks"),
@@ -54,10 +57,14 @@ def run(options: argparse.Namespace) -> int:
         )
     if options.part is not None and options.name != "poles":
         raise ValueError(f"--part: {options.part} is a table of `benchmark poles`")
+    if options.row is not None and options.name != "faults":
+        raise ValueError(f"--row: {options.row} is a row of `benchmark faults`")
     options.output.mkdir(parents=True, exist_ok=True)
     for name in NAMES if options.name is None else (options.name,):
         extra = {"full": True} if options.full and name in WITH_FULL else {}
         if options.part is not None:
             extra["part"] = options.part
+        if options.row is not None:
+            extra["row"] = options.row
         print(import_module(f"benchmarks.{name}").run(options.output, options.quick, **extra))
     return 0

@@ -27,7 +27,9 @@ def test_a_domain_with_nodes_of_another_session_is_refused(monkeypatch, name, na
         node = rclpy.create_node(name, namespace=namespace)
         assert not domain_is_free(domain)
         if refused:
-            with pytest.raises(ValueError, match=rf"ROS_DOMAIN_ID: {domain} has scan_node of another"):
+            with pytest.raises(
+                ValueError, match=rf"ROS_DOMAIN_ID: {domain} has scan_node of another"
+            ):
                 require_own_domain()
         else:
             require_own_domain()
