@@ -11,7 +11,7 @@ import textwrap
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,18 +25,23 @@ from tactile_resonance.scan.map_messages import cloud_message, marker_message, s
 from tactile_resonance.scan.messages import header_message, message_types, to_cdr
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import FileContent
-from tactile_resonance.scan.point_result import TYPE, PointResult, from_message
+from tactile_resonance.scan.point_result import TYPE, PointResult, from_message, serialised
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
 from tactile_resonance.scan.progress import Controls
-from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.run_content import RECORDING, file_of, read_run
 from tactile_resonance.scan.run_directory import RunDirectory
+from tactile_resonance.scan.run_index import entry_of, read_entries, write_entries
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.strict_yaml import dump_yaml
 
-POINTS, PARTS = 10_000, 10
+POINTS, PARTS, QUICK = 10_000, 10, 100
+FILLED = (
+    "With `--quick`: only a hundredth of the points at the beginning and at the end are scanned, as a run "
+    "that is opened again; those between are copies of one, and their rows here are missing."
+)
 SPACING_M = 5e-4
 
 
@@ -104,10 +109,10 @@ def memory_mb() -> float:
 
 
 class Course:
-    """Takes a scan's results as a map node does, and notes what each point took."""
+    """Takes a scan's results as a map node does, and notes what each point took, in parts of so many."""
 
-    def __init__(self, points: int) -> None:
-        self._tenth = max(1, points // PARTS)
+    def __init__(self, each: int) -> None:
+        self._each, self.before = each, 0
         self._times: list[tuple[float, ...]] = []
         self.map_s = 0.0
         self.grown = GrowingMap()
@@ -120,19 +125,19 @@ class Course:
         self.map_s += time.process_time() - begun_s
         clocks_s = time.perf_counter(), time.process_time() - self.map_s, *others_s, self.map_s
         self._times.append(clocks_s)
-        if len(self._times) % self._tenth == 0:
+        if len(self._times) == self._each:
             self._end_part()
+            self._times.clear()
 
     def _end_part(self) -> None:
         files, held_mb = len(os.listdir("/proc/self/fd")), memory_mb()
-        steps_ms = 1e3 * np.diff(self._times[-self._tenth :], axis=0)  # (points - 1, clocks)
+        steps_ms = 1e3 * np.diff(self._times, axis=0)  # (points - 1, clocks)
         wall, point, poles, _, on_map = np.median(steps_ms, axis=0).tolist()
         summary = float(np.mean(steps_ms[:, 3]))
         drawn = tuple(drawn_ms(self.grown.map))
-        count = len(self._times)
-        self.parts.append(Part(count, wall, point, poles, summary, on_map, drawn, held_mb, files))
-        # what drawing took is of no point
-        self._times = [(float("nan"),) * 5] * count
+        self.before += self._each
+        figures = wall, point, poles, summary, on_map
+        self.parts.append(Part(self.before, *figures, drawn, held_mb, files))
         print(self.parts[-1], flush=True)
 
 
@@ -151,38 +156,68 @@ def drawn_ms(pole_map: PoleMap) -> Iterator[float]:
 
 def run(output: Path, quick: bool, points: int = POINTS) -> str:
     """Scan, resume, read, report; write ``endurance.md`` into `output`, and return the page."""
-    points = points // PARTS if quick else points
     with TemporaryDirectory() as folder:
         path, target = Path(folder) / "scene.yaml", Path(folder) / "run"
         text = dump_yaml(content(points))
         path.write_text(text)
         plan = make_plan(read_scan_scene(path))
         hands = VirtualHands(read_scene(read_tissues(), path), 1.2)
-        course = Course(len(plan.points))
-        with TimedRun.create(target, text, plan.points, {"seed": 1}) as made:
+        count = len(plan.points)
+        course = Course(max(2, count // (QUICK if quick else PARTS)))
+
+        def scan(made: TimedRun, until: int) -> None:
+            controls = Controls()
 
             def publish(cdr: bytes) -> None:
                 course.take(cdr, hands.computing_s, made.summaries_s)
+                if len(course.parts) == until:
+                    controls.cancelled.set()
 
-            ScanRunner(plan, made, hands, Controls(), lambda progress: None, 1, publish).run()
+            with made:
+                ScanRunner(plan, made, hands, controls, lambda progress: None, 1, publish).run()
+
+        scan(TimedRun.create(target, text, plan.points, {"seed": 1}), 1 if quick else PARTS)
+        if quick:
+            course.before = fill(target, count - count // QUICK)
+            course.grown = GrowingMap(read_run(target).latest)
+            scan(TimedRun.open(target), 2)
         size_mb = sum(file.stat().st_size for file in target.rglob("*") if file.is_file()) / 1e6
         clocks_s = []
         for action in (
             lambda: RunDirectory.open(target).close(),
             lambda: read_run(target),
-            lambda: report_run(target),
+            *([] if quick else [lambda: report_run(target)]),
         ):
             begun_s, begun_cpu_s = time.perf_counter(), time.process_time()
             with redirect_stdout(StringIO()):
                 action()
             clocks_s += [time.perf_counter() - begun_s, time.process_time() - begun_cpu_s]
             print(clocks_s, flush=True)
-    page = _page(course.parts, size_mb, clocks_s)
+    page = _page(course.parts, size_mb, clocks_s, quick)
     write_whole(output / "endurance.md", page.encode())
     return page
 
 
-def _page(parts: Sequence[Part], size_mb: float, clocks_s: Sequence[float]) -> str:
+def fill(run: Path, points: int) -> int:
+    """Finish the points of a run up to so many, each with the file of the last one; the number of points."""
+    content, entries = read_run(run), list(read_entries(run).values())
+    like, kept = content.latest[-1], content.files[-1]
+    file = file_of(run, like).read_bytes()
+    for point in content.points[len(content.latest) : points]:
+        x_m, y_m, z_m = point.position_m
+        result = replace(like, index=point.index, attempt=0, x_m=x_m, y_m=y_m, z_m=z_m)
+        result = replace(result, measurement_id=like.measurement_id + point.index, label=point.label)
+        path = file_of(run, result)
+        path.write_bytes(file)
+        name = f"{RECORDING}/{path.name}"
+        entries.append(entry_of(path, name, replace(kept, name=path.name), serialised(result)))
+    write_entries(run, entries)
+    return points
+
+
+def _page(
+    parts: Sequence[Part], size_mb: float, clocks_s: Sequence[float], quick: bool
+) -> str:
     rows = [
         f"| {p.points} | {p.wall_ms:.1f} | {p.point_ms:.1f} | {p.poles_ms:.1f} | {p.summary_ms:.2f} | "
         f"{p.map_ms:.2f} | {' | '.join(f'{ms:.0f}' for ms in p.drawn_ms)} | {p.memory_mb:.0f} | {p.files} |"
@@ -198,10 +233,11 @@ def _page(parts: Sequence[Part], size_mb: float, clocks_s: Sequence[float]) -> s
             "",
             *textwrap.wrap((__doc__ or "").split("\n")[0], 112),
             "",
+            *(textwrap.wrap(FILLED, 112) + [""] if quick else []),
             *textwrap.wrap(
                 "Simulated, in virtual time and one process: the runner, the folder and the estimator as "
                 "scan_node, frf_node and poles_node use them; no robot, no nodes (those: "
-                "[with the robot](endurance_robot.md), [an hour](endurance_hour.md)). Medians over each "
+                "[on the wall clock](endurance_hour.md)). Medians over each "
                 "tenth of processor times, which other work on the machine changes little, and of its "
                 "clock, which it does change. Summaries are the row of `results.csv` and, after each "
                 "twentieth of the points, the bag's metadata: their mean. Map: what a map node does with "
@@ -224,8 +260,8 @@ def _page(parts: Sequence[Part], size_mb: float, clocks_s: Sequence[float]) -> s
             *textwrap.wrap(
                 f"The folder has {size_mb:.0f} MB. Times on the clock, of the processor in brackets: "
                 f"opened again to go on {clocks_s[0]:.1f} s ({clocks_s[1]:.1f} s), every byte of the "
-                f"recording compared with its checksum; read {clocks_s[2]:.1f} s ({clocks_s[3]:.1f} s); "
-                f"`report` {clocks_s[4]:.0f} s ({clocks_s[5]:.0f} s).",
+                f"recording compared with its checksum; read {clocks_s[2]:.1f} s ({clocks_s[3]:.1f} s)"
+                + ("." if quick else f"; `report` {clocks_s[4]:.0f} s ({clocks_s[5]:.0f} s)."),
                 112,
             ),
             "",

@@ -119,7 +119,7 @@ class RunDirectory:
         facts: Mapping[str, Any],
         needed_bytes: int = 0,
         places: Sequence[ScanPoint] = (),
-    ) -> RunDirectory:
+    ) -> Self:
         """Begin a run.
 
         Parameters
@@ -180,7 +180,7 @@ class RunDirectory:
             )
 
     @classmethod
-    def open(cls, path: Path) -> RunDirectory:
+    def open(cls, path: Path) -> Self:
         """Go on with a run, after whatever ended it.
 
         Removes what was not finished and makes ``metadata.yaml`` and ``results.csv`` anew from the
@@ -210,7 +210,7 @@ class RunDirectory:
             os.close(lock)
             raise
 
-    def __enter__(self) -> RunDirectory:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
