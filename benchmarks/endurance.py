@@ -40,7 +40,8 @@ from tactile_resonance.strict_yaml import dump_yaml
 POINTS, PARTS, QUICK = 10_000, 10, 100
 FILLED = (
     "With `--quick`: only a hundredth of the points at the beginning and at the end are scanned, as a run "
-    "that is opened again; those between are copies of one, and their rows here are missing."
+    "that is opened again; those between are copies of one, and their rows here are missing. Memory is "
+    "then that of a process that has read the whole run several times, not of one that has scanned it."
 )
 SPACING_M = 5e-4
 

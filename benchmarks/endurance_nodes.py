@@ -279,7 +279,9 @@ def page(scan: LongScan, title: str, setting: str) -> str:
             "",
             *processes_table(scan),
             "",
-            *textwrap.wrap(f"The command ended with status {scan.status}: {end[-2] if end else ''}", 112),
+            f"The command ended with status {scan.status}.",
+            "",
+            *(f"    {line}" for line in [*end, *scan.errors.splitlines()][-3:]),
             "",
         ]
     )
