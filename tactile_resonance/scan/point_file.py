@@ -30,6 +30,7 @@ from rosbags.typesys import TypesysError
 
 from tactile_resonance.files import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
+from tactile_resonance.scan.mcap_checksums import write_checksums
 from tactile_resonance.scan.messages import (
     OtherVersionError,
     definition_and_hash,
@@ -187,6 +188,7 @@ class PointFileWriter:
         self._open = False
         self._writer.close()
         written = self._folder / self._target.name
+        write_checksums(written)
         descriptor = os.open(written, os.O_RDONLY)
         try:
             os.fsync(descriptor)

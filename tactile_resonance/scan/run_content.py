@@ -12,17 +12,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 from tactile_resonance.fields import read_dataclass
+from tactile_resonance.scan.mcap_checksums import is_checked
 from tactile_resonance.scan.point_file import FileContent, read_content, read_messages
 from tactile_resonance.scan.point_result import TOPIC, PointResult, from_message
-from tactile_resonance.scan.run_index import Entry, read_entries
+from tactile_resonance.scan.run_index import Entry, damaged_lines, read_entries
 from tactile_resonance.scan.scan_point import ScanPoint
 
 NOT_CHECKED = "{} files are not checked for damage: an earlier version recorded them"
 FORMAT = "tactile_resonance run 1"
 RECORDING, SCENE = "recording", "scene.yaml"
 POINT_FILE = re.compile(r"point-(\d{5})-(\d{2,})\.mcap")
+CHECKSUM = "crc32"
+"""Field of ``run.json``."""
+PLAN_DAMAGED = "run.json: differs from what was written (checksum)"
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ class RunContent:
     problems : tuple of str
         Damaged, missing and foreign files, by name.
     unchecked : int
-        Files whose checksum is not known: an earlier version finished them.
+        Files without a line in the index that hold no checksums either: an earlier version finished them.
     places : tuple of ScanPoint
         Among which an adaptive scan chooses its points; empty: all points are known beforehand.
     """
@@ -94,8 +99,8 @@ def file_of(run: Path, result: PointResult) -> Path:
 def read_run(path: Path) -> RunContent:
     """Everything readable of a run, of one that is being recorded too.
 
-    Every byte is compared with the checksums of ``index.jsonl``; a damaged file counts as if it were not there,
-    and its point as not finished.
+    Every byte is compared with the checksums of ``index.jsonl``, or, where a file has no line there, with those
+    in the file itself; a damaged file counts as if it were not there, and its point as not finished.
 
     Raises
     ------
@@ -112,15 +117,17 @@ def read_run(path: Path) -> RunContent:
     # after the names: each has its point in the plan and its line before
     run = read_plan(path)
     entries = read_entries(run.path)
-    problems, files, results = _missing(run.path, entries), [], []
+    files, results, unchecked = [], [], 0
+    problems = [*run.problems, *damaged_lines(run.path), *_missing(run.path, entries)]
     scene = entries.get(SCENE)
     if scene is not None and (damage := scene.damage(run.path / SCENE)):
         problems.append(f"{SCENE}: {damage}")
     with ThreadPoolExecutor() as pool:  # a checksum holds no lock of the interpreter
         read = pool.map(lambda name: _checked(names[name], entries.get(name), run), names)
-        for content, result, problem in read:
+        for content, result, problem, checked in read:
             if content is not None:
                 files.append(content)
+                unchecked += not checked
             if result is not None:
                 results.append(result)
             if problem:
@@ -130,7 +137,7 @@ def read_run(path: Path) -> RunContent:
         files=tuple(files),
         results=in_order(results),
         problems=tuple(problems),
-        unchecked=sum(f"{RECORDING}/{file.name}" not in entries for file in files),
+        unchecked=unchecked,
     )
 
 
@@ -148,18 +155,28 @@ def _missing(run: Path, entries: Mapping[str, Entry]) -> list[str]:
 
 def _checked(
     path: Path, entry: Entry | None, run: RunContent
-) -> tuple[FileContent | None, PointResult | None, str]:
-    """What a file holds, its result, and what is wrong with it."""
+) -> tuple[FileContent | None, PointResult | None, str, bool]:
+    """What a file holds, its result, what is wrong with it, and whether it was compared with a checksum."""
     try:
         if entry is not None and (damage := entry.damage(path)):
-            return None, None, f"{path.name}: {damage}"
+            return None, None, f"{path.name}: {damage}", True
         result = None if entry is None else entry.result
         if entry is None or result is None:
-            return *_read_file(path, len(run.points)), ""
+            checked = entry is not None or _is_checked(path)
+            return *_read_file(path, len(run.points)), "", checked
         match = POINT_FILE.fullmatch(path.name)
-        return entry.content, None if match is None else _named(result, match, len(run.points)), ""
+        named = None if match is None else _named(result, match, len(run.points))
+        return entry.content, named, "", True
     except (OSError, ValueError) as error:
-        return None, None, str(error)
+        return None, None, str(error), True
+
+
+def _is_checked(path: Path) -> bool:
+    """Whether a file that is not in the index agrees with the checksums that it holds itself."""
+    try:
+        return is_checked(path)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: damaged or foreign file ({error})") from error
 
 
 def in_order(results: Iterable[PointResult]) -> tuple[PointResult, ...]:
@@ -191,9 +208,16 @@ def read_plan(path: Path) -> RunContent:
             )
         )
         facts = content["facts"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        written = content.pop(CHECKSUM, None)  # earlier versions wrote none
+        problems = () if written in (None, checksum_of(content)) else (PLAN_DAMAGED,)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"run: {path} cannot be read as a run ({error})") from error
-    return RunContent(path, scene, facts, points, places=places)
+    return RunContent(path, scene, facts, points, problems=problems, places=places)
+
+
+def checksum_of(content: Mapping[str, Any]) -> int:
+    """CRC-32 of the content of a JSON file, however it is spaced."""
+    return crc32(json.dumps(content).encode())
 
 
 def _read_file(path: Path, points: int) -> tuple[FileContent, PointResult | None]:

@@ -54,11 +54,14 @@ from tactile_resonance.scan.point_result import (
 )
 from tactile_resonance.scan.results_file import ResultsFile
 from tactile_resonance.scan.run_content import (
+    CHECKSUM,
     FORMAT,
+    PLAN_DAMAGED,
     POINT_FILE,
     RECORDING,
     SCENE,
     RunContent,
+    checksum_of,
     in_order,
     read_run,
 )
@@ -189,13 +192,15 @@ class RunDirectory:
         Raises
         ------
         ValueError
-            If it is no run, another process is recording it, or its messages are of another version: no
-            reader takes two definitions of one type in one bag.
+            If it is no run, its plan is damaged, another process is recording it, or its messages are of
+            another version: no reader takes two definitions of one type in one bag.
         """
         path = Path(path)
         lock = _lock(path)
         try:
             content = read_run(path)
+            if PLAN_DAMAGED in content.problems:
+                raise ValueError(f"run: {path}: {PLAN_DAMAGED}: nobody knows where its points lie")
             if other := _other_definitions(content):
                 raise ValueError(
                     f"run: {path} was recorded by a version with other definitions of {', '.join(other)}; "
@@ -376,13 +381,14 @@ def expected_bytes(points: int, design: MeasurementDesign) -> int:
 
 def _plan_text(content: RunContent) -> bytes:
     """``run.json``; places only where there are some."""
-    plan = {
+    plan: dict[str, Any] = {
         "format": FORMAT,
         "facts": dict(content.facts),
         "points": [point.as_json() for point in content.points],
     }
     if content.places:
         plan["places"] = [point.as_json() for point in content.places]
+    plan[CHECKSUM] = checksum_of(plan)
     return (json.dumps(plan, indent=1, allow_nan=False) + "\n").encode()
 
 

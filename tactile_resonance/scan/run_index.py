@@ -14,7 +14,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -113,16 +113,12 @@ def write_entries(run: Path, entries: Iterable[Entry]) -> None:
 def read_entries(run: Path) -> dict[str, Entry]:
     """The last valid line of each file, by its name and in the order of the lines.
 
-    A line that is damaged or of another format is left out: its file is then read, and not checked.
+    A line that is damaged or of another format is left out: its file is then read, and checked only by what
+    it holds itself; see `damaged_lines`.
     """
     entries: dict[str, Entry] = {}
-    try:
-        lines = (run / INDEX).read_bytes().splitlines()
-    except FileNotFoundError:
-        return entries
-    for line in lines:
-        checksum, _, text = line.partition(b" ")
-        if checksum != b"%08x" % zlib.crc32(text):
+    for _, text in _lines(run):
+        if text is None:
             continue
         try:
             entry = _entry(json.loads(text))
@@ -131,6 +127,29 @@ def read_entries(run: Path) -> dict[str, Entry]:
         entries.pop(entry.name, None)
         entries[entry.name] = entry
     return entries
+
+
+def damaged_lines(run: Path) -> list[str]:
+    """Lines that do not agree with their checksum, as texts.
+
+    The last one may be cut short: it is, where a run was interrupted while it was written.
+    """
+    return [
+        f"{INDEX}: line {number} is damaged; the file that it was of is compared with its own checksums alone"
+        for number, text in _lines(run)
+        if text is None
+    ]
+
+
+def _lines(run: Path) -> Iterator[tuple[int, bytes | None]]:
+    """Number and JSON of each line; None where it is damaged. The rest after the last line is left out."""
+    try:
+        whole = (run / INDEX).read_bytes()
+    except FileNotFoundError:
+        return
+    for number, line in enumerate(whole.split(b"\n")[:-1], start=1):
+        checksum, _, text = line.partition(b" ")
+        yield number, text if checksum == b"%08x" % zlib.crc32(text) else None
 
 
 def _line(entry: Entry) -> bytes:

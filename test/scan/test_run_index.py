@@ -8,7 +8,10 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader, ReaderError
 
+from tactile_resonance.scan import point_file
 from tactile_resonance.scan.point_result import PointKind
 from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.run_content import read_run
@@ -63,7 +66,7 @@ def test_no_flipped_bit_of_a_recording_is_silent(tmp_path):
 
 
 def test_no_flipped_bit_of_the_index_changes_a_result(tmp_path):
-    """Its line is left out, and the file read in its place; where the run was interrupted it goes on."""
+    """Its line is named and left out, and the file read in its place, compared with its own checksums."""
     run, random = recorded(tmp_path / "run"), np.random.default_rng(22)
     whole, index = read_run(run), run / INDEX
     before = index.read_bytes()
@@ -72,9 +75,49 @@ def test_no_flipped_bit_of_the_index_changes_a_result(tmp_path):
         found = read_run(run)
         assert_all_same(found.results, whole.results)
         assert found.files == whole.files
-        assert found.problems == ()
-        assert found.unchecked <= 2  # a flipped end of line takes the next one with it
+        torn = not index.read_bytes().endswith(b"\n")  # as an interruption leaves it
+        assert torn or all(text.startswith("index.jsonl: line ") for text in found.problems)
+        assert len(found.problems) == (not torn)  # a flipped end of line takes the next one with it
+        assert found.unchecked == 0
         index.write_bytes(before)
+
+
+def test_no_flipped_bit_of_a_file_without_its_index_is_silent(tmp_path):
+    """Of a file that was copied out of its run, or whose index is lost: it holds checksums itself."""
+    run, random = recorded(tmp_path / "run"), np.random.default_rng(23)
+    (run / INDEX).unlink()
+    files = sorted((run / "recording").glob("*.mcap"))
+    assert (read_run(run).problems, read_run(run).unchecked) == ((), 0)
+    for path in [files[k] for k in random.integers(len(files), size=FLIPS)]:
+        before = path.read_bytes()
+        path.write_bytes(flipped(path, random))
+        (problem,) = read_run(run).problems
+        path.write_bytes(before)
+        assert problem.startswith(f"{path.name}: damaged or foreign file (")
+    for size in (0, 1, 8, 20, len(before) // 2, len(before) - 1):
+        path.write_bytes(before[:size])
+        (problem,) = read_run(run).problems
+        assert problem.startswith(f"{path.name}: damaged or foreign file (")
+
+
+def test_rosbags_reads_no_sample_that_does_not_agree_with_its_chunk(tmp_path):
+    """Its reader compares what is there; it writes no checksums itself."""
+    run = recorded(tmp_path / "run", 1)
+    path = run / "recording" / "point-00000-00.mcap"
+    samples = record_cdr(0)[-400:]
+    whole = path.read_bytes()
+    at = whole.index(samples) + 200
+    path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+    with pytest.raises(ReaderError, match="Chunk checksum mismatch"), Reader(path) as reader:
+        list(reader.messages())
+
+
+def test_files_of_earlier_versions_are_read_and_said_not_to_be_checked(tmp_path, monkeypatch):
+    monkeypatch.setattr(point_file, "write_checksums", lambda path: None)
+    run = recorded(tmp_path / "run")
+    assert read_run(run).unchecked == 0  # the index has theirs
+    (run / INDEX).unlink()
+    assert (read_run(run).problems, read_run(run).unchecked) == ((), 4)
 
 
 def test_a_changed_scene_and_a_missing_file_are_named(tmp_path):
@@ -95,7 +138,7 @@ def test_results_and_messages_from_the_index_are_those_of_the_files(tmp_path):
     messages = list(recorded_results(with_index))
     (run / INDEX).unlink()  # as of an earlier version
     without = read_run(run)
-    assert (with_index.unchecked, without.unchecked) == (0, 4)
+    assert (with_index.unchecked, without.unchecked) == (0, 0)
     assert_all_same(with_index.results, without.results)
     assert with_index.files == without.files
     assert list(recorded_results(without)) == messages
@@ -126,7 +169,7 @@ def test_half_a_first_line_does_not_swallow_the_next(tmp_path):
     with RunDirectory.open(run) as again:
         record_point(again, 0)
     found = read_run(run)
-    assert (len(found.files), found.unchecked) == (4, 3)  # the new one is checked
+    assert (len(found.files), found.problems) == (4, ())
 
 
 JUNK = (None, -1, 2**70, 0.5, True, "x", "a" * 5000, "../../x.mcap", [], [1], {}, {"name": 1})
