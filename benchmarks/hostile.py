@@ -17,7 +17,8 @@ import resource
 import signal
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -26,6 +27,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.hostile_flips import FLIPS, QUICK_FLIPS, flipped_bits
 from benchmarks.hostile_targets import PROCESS_WITHIN_S, WITHIN_S, Target, targets
 from benchmarks.hostile_wire import wire_targets
 
@@ -233,16 +235,18 @@ def run(output: Path, quick: bool, full: bool = False) -> str:
     with TemporaryDirectory() as folder:
         every = [*targets(Path(folder)), *wire_targets()]
         done = _tried_apart(every, inputs, Path(folder))
+    with TemporaryDirectory() as folder:
+        flips = flipped_bits(Path(folder), QUICK_FLIPS if quick else FLIPS)
     for of in done:
         for k, data in enumerate(of.wrong.values()):
             name = re.sub(r"\W+", "-", of.name)
             (output / f"hostile-{name}-{k}.bin").write_bytes(data)
-    text = _page(done)
+    text = _page(done, flips)
     (output / "hostile.md").write_text(text, encoding="utf-8")
     return text
 
 
-def _page(done: Sequence[Answers]) -> str:
+def _page(done: Sequence[Answers], flips: Mapping[str, Counter[str]]) -> str:
     wrong = sum(len(of.wrong) for of in done)
     assert __doc__ is not None
     about = " ".join(__doc__.split("\n\n", 1)[1].split())
@@ -265,5 +269,29 @@ def _page(done: Sequence[Answers]) -> str:
         ),
         "",
     ]
-    lines += [f"- {of.name}: {kind}" for of in done for kind in of.wrong]
-    return "\n".join(lines).rstrip() + "\n"
+    wrong_answers = [f"- {of.name}: {kind}" for of in done for kind in of.wrong]
+    lines += [*wrong_answers, ""] if wrong_answers else []
+    return "\n".join([*lines, *_flips_table(flips)])
+
+
+def _flips_table(flips: Mapping[str, Counter[str]]) -> list[str]:
+    every = sum(flips.values(), Counter[str]())
+    ends = "refused", "named", "without effect", "silent"
+    return [
+        "## Flipped bits",
+        "",
+        "One bit of one file. The file is refused; or the damage is named, and what was read from the file is "
+        "left out; or all that is read is equal to the last digit, samples included; else it is silent. Files "
+        "that follow from the recording (`results.csv`, `metadata.yaml`, those of `report`) hold no checksums, "
+        "and the package does not read them.",
+        "",
+        f"**Silent: {every['silent']} of {every.total()}.**",
+        "",
+        f"| file | flips | {' | '.join(ends)} |",
+        "|---|" + "---:|" * (1 + len(ends)),
+        *(
+            f"| {name} | {of.total()} | {' | '.join(str(of[end]) for end in ends)} |"
+            for name, of in flips.items()
+        ),
+        "",
+    ]

@@ -31,6 +31,8 @@ from tactile_resonance.report.drawing import new_figure, save_figure
 KEPT = Path("docs/benchmarks/overview.json")
 WORSE = {"time": 1.5, "error": 1.15, "count": 1.0}
 """A figure is reported from so many times the kept one on."""
+SLOWER = 2.0
+"""So many times more of a time in few repetitions, on whatever machine."""
 CLEARLY = 0.05
 """Errors of few runs that differ by less are alike."""
 CALLED, ROUNDS, COVERED = 400, 7, 4000
@@ -94,6 +96,25 @@ def run(output: Path, quick: bool) -> str:
     (output / "overview.json").write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
     _draw(methods, scalings, output / "overview.png")
     return text
+
+
+def guard() -> tuple[str, bool]:
+    """`compared` with what follows from seeds alone, and with times in few repetitions; nothing is written."""
+    return compared([*_frf_values(quick=True), *_coverage(), *_stability()])
+
+
+def compared(values: Sequence[Value]) -> tuple[str, bool]:
+    """Values beside those kept, as text, and whether none is worse; times, which the machine makes, never are.
+
+    Raises
+    ------
+    ValueError
+        Where the figures kept cannot be read.
+    """
+    worse = [of.name for of in values if of.kind != "time" and _worse([of])]
+    lines = [f"{'worse: ' if of.name in worse else ''}{of.name}: {of.text}" for of in values]
+    lines += [f"slower: {text}" for of in values if of.kind == "time" for text in _worse([of], SLOWER)]
+    return "\n".join(lines), not worse
 
 
 def _frf_values(quick: bool) -> list[Value]:
@@ -217,8 +238,8 @@ def _least_s(call: Callable[[], object], rounds: int) -> float:
     return max(min(times), 1e-9)
 
 
-def _worse(values: Sequence[Value]) -> list[str]:
-    """What has become worse than the figures kept."""
+def _worse(values: Sequence[Value], slack: float = 1.0) -> list[str]:
+    """What has become worse than the figures kept, by `slack` times more than is accepted of its kind."""
     if not KEPT.exists():
         return []
     try:
@@ -228,7 +249,7 @@ def _worse(values: Sequence[Value]) -> list[str]:
     return [
         f"{of.name}: {of.value:.3g}, {kept[of.name]:.3g} before"
         for of in values
-        if of.name in kept and of.value > WORSE[of.kind] * kept[of.name]
+        if of.name in kept and of.value > slack * WORSE[of.kind] * kept[of.name]
     ]
 
 

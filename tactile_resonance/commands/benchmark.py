@@ -40,6 +40,12 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--row", metavar="TEXT", help="renew the rows of faults whose names hold this; default: all"
     )
     parser.add_argument(
+        "--guard",
+        action="store_true",
+        help="overview: compare what follows from seeds alone with the figures kept, write nothing, and fail "
+        "where one has become worse",
+    )
+    parser.add_argument(
         "--output",
         type=Path,
         default=Path("docs/benchmarks"),
@@ -59,6 +65,12 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"--part: {options.part} is a table of `benchmark poles`")
     if options.row is not None and options.name != "faults":
         raise ValueError(f"--row: {options.row} is a row of `benchmark faults`")
+    if options.guard:
+        if options.name != "overview":
+            raise ValueError("--guard: accepted is `benchmark overview --guard`")
+        text, good = import_module("benchmarks.overview").guard()
+        print(text)
+        return 0 if good else 1
     options.output.mkdir(parents=True, exist_ok=True)
     for name in NAMES if options.name is None else (options.name,):
         extra = {"full": True} if options.full and name in WITH_FULL else {}
