@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated robot knows nothing of the bench: of the house it uses arithmetic and checked fields alone."""
+"""The simulated robot knows nothing of the bench: it uses arithmetic, fields and kinds of arrays alone."""
 
 import ast
 from pathlib import Path
@@ -7,6 +7,7 @@ from pathlib import Path
 import tactile_resonance.simulation.ur5e
 
 ALLOWED = {
+    "tactile_resonance._typing",
     "tactile_resonance.contact.vectors",
     "tactile_resonance.fields",
     "tactile_resonance.simulation.noise",
