@@ -141,11 +141,11 @@ def lacking_terms(
     direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
     exceeded by chance with ``(1 - R)^(dof - 1)``.
     """
-    problem, directions = plan.problem, plan.directions
+    directions = plan.directions
     dof = data.undriven + data.driven - theta.shape[1] / 2
     best, fall, chance = best_fall(
+        plan.problem.tables,
         data.arrays,
-        problem.tables.undriven.last.shape[0],
         plan.driven_bases,
         theta,
         inverse,

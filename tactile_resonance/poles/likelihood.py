@@ -912,13 +912,13 @@ def _fall(pair, own, slope, power, inverse, score, crossed):
 
 @_entry
 @njit(**OPTIONS)
-def best_fall(data, undriven_blocks, bases, theta, inverse, cost, dof, numerator, modes):
+def best_fall(tables, data, bases, theta, inverse, cost, dof, numerator, modes):
     """What the cost of fitted points of one record falls by most with a pair of directions of the response.
 
     Parameters
     ----------
+    tables : Tables
     data : Arrays
-    undriven_blocks : int
     bases : tuple of (K, terms) complex
         Of A, B and C on driven bins.
     theta : (points, n) float
@@ -942,56 +942,44 @@ def best_fall(data, undriven_blocks, bases, theta, inverse, cost, dof, numerator
         Logarithm of the probability that noise makes as much, for N modes tried.
     """
     basis_a, basis_b, basis_c = bases
+    _, last, basis, row, place_of, _, _, _ = tables.driven
     y, u, _, variance_y, variance_u, covariance = data
     points, n = theta.shape
     bins, a, b = basis_a.shape[0], basis_a.shape[1] - 1, basis_b.shape[1]
     own, slope, power = np.empty((n, 2, bins)), np.empty((2, bins)), np.empty(bins)
     pair, score, crossed = np.empty((2, 2, bins)), np.empty(2), np.empty((2, n))
-    flat = np.zeros((ROWS, BLOCK))
+    memory, _, _, _, at, _, _ = _memory(1, tables.c, n)
+    flat, rows = memory[:2]
     best, found, least = np.zeros(points, np.int64), np.zeros(points), np.zeros(points)
     trials = np.log(max(modes.shape[0], 1))
     for point in range(points):
-        at = theta[point]
+        _inside(theta[point : point + 1], tables.c, at)
         for k in range(bins):
             block, place = k // BLOCK, k % BLOCK
             if place == 0:
-                _fill(variance_y[point, 0], block, ROW_VY, 1, flat)
-                _fill(variance_u[point, 0], block, ROW_VU, 1, flat)
-                _fill(covariance[point, 0], block, ROW_COV, 2, flat)
-            here = undriven_blocks + block
-            its_y = complex(y[point, 0, here, 0, place], y[point, 0, here, 1, place])
-            its_u = complex(u[point, 0, here, 0, place], u[point, 0, here, 1, place])
-            of_a, g, decay = basis_a[k, a], 0j, 0j
-            for i in range(a):
-                of_a += at[i] * basis_a[k, i]
-            for i in range(b):
-                g += at[a + i] * basis_b[k, i]
-            for i in range(basis_c.shape[1]):
-                decay += at[a + b + i] * basis_c[k, i]
-            of_a = 1 / of_a
-            g *= of_a
-            model = g * its_u + decay * of_a
-            error = its_y - model
-            common = complex(flat[ROW_COV, place], -flat[ROW_COV + 1, place])
-            by_g = flat[ROW_VU, place] * g.conjugate() - common
-            w = 1 / (flat[ROW_VY, place] + ((by_g - common) * g).real)
-            squared = error.real * error.real + error.imag * error.imag
-            # what a response more takes off half the cost
-            of_slope = error.conjugate() * its_u * w + by_g * (squared * w * w)
+                _fill(variance_y[point, 0], block, ROW_VY, 1, rows)
+                _fill(variance_u[point, 0], block, ROW_VU, 1, rows)
+                _fill(covariance[point, 0], block, ROW_COV, 2, rows)
+                _combine(basis, row, place_of, block, at[0], False, rows)
+                _weigh_driven(y, u, point, 0, y.shape[2] - last.shape[0] + block, flat)
+            of_a = complex(rows[ROW_A, place], rows[ROW_A + 1, place])
+            # what a response more takes off half the cost; weights are those of B, the response times A
+            of_slope = -of_a * complex(rows[ROW_OF_B, place], rows[ROW_OF_B + 1, place])
             slope[0, k], slope[1, k] = of_slope.real, of_slope.imag
-            power[k] = w * (its_u.real * its_u.real + its_u.imag * its_u.imag)
-            scaled = of_a.conjugate() * its_u * w
-            by_a, by_b = -model.conjugate() * scaled, its_u.conjugate() * scaled
+            power[k] = rows[ROW_BB, place] * (of_a.real * of_a.real + of_a.imag * of_a.imag)
+            by_a = of_a * complex(rows[ROW_AB, place], rows[ROW_AB + 1, place])
+            by_b = of_a * rows[ROW_BB, place]
+            by_c = of_a * complex(rows[ROW_BC, place], -rows[ROW_BC + 1, place])
             for i in range(n):
                 if i < a:
                     value = by_a * basis_a[k, i].conjugate()
                 elif i < a + b:
                     value = by_b * basis_b[k, i - a].conjugate()
                 else:
-                    value = scaled * basis_c[k, i - a - b].conjugate()
+                    value = by_c * basis_c[k, i - a - b].conjugate()
                 own[i, 0, k], own[i, 1, k] = value.real, value.imag
             for r in range(2):
-                value = of_a * numerator[k, r]
+                value = numerator[k, r] / of_a
                 pair[r, 0, k], pair[r, 1, k] = value.real, value.imag
         for m in range(1 + modes.shape[0]):
             tried = pair if m == 0 else modes[m - 1]

@@ -271,4 +271,4 @@ def _call_kernels() -> None:
     two = np.ones((bins - undriven, 2), complex)
     bases = (two, one[undriven:], one[undriven:])
     at, inverse = theta[:, 0, :3], inverse[:, :3, :3]
-    likelihood.best_fall(data, 1, bases, at, inverse, np.ones(1), 9.0, two, modes)
+    likelihood.best_fall(tables, data, bases, at, inverse, np.ones(1), 9.0, two, modes)
