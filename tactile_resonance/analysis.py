@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import band, number, require_kind
+from tactile_resonance.fields import band, known, number, require_kind
 from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.distortion import Distortion, estimate_distortion
 from tactile_resonance.frf.estimate import frf_of_record
@@ -195,9 +195,9 @@ def analysis_as_json(analysis: Analysis) -> str:
     content = {
         "frf": {
             "frequency_hz": frf.frequency_hz.tolist(),
-            "real": _numbers(frf.g.real),
-            "imag": _numbers(frf.g.imag),
-            "variance": None if frf.variance is None else _numbers(frf.variance),
+            "real": [known(value) for value in frf.g.real],
+            "imag": [known(value) for value in frf.g.imag],
+            "variance": None if frf.variance is None else [known(value) for value in frf.variance],
         },
         "poles": [
             {
@@ -222,9 +222,9 @@ def analysis_as_json(analysis: Analysis) -> str:
         "lines": poles.lines,
         "order": poles.structure.order,
         "numerator_order": poles.structure.numerator_order,
-        "cost": _number(poles.cost),
-        "expected_cost": _number(poles.expected_cost),
-        "condition_number": _number(poles.condition_number),
+        "cost": known(poles.cost),
+        "expected_cost": known(poles.expected_cost),
+        "condition_number": known(poles.condition_number),
         "method": poles.method,
         "variance_model": poles.variance_model,
         "distortion": _distortion(analysis.distortion),
@@ -242,13 +242,13 @@ def _distortion(distortion: Distortion | None) -> dict | None:
     return {
         name: {
             "frequency_hz": lines.frequency_hz.tolist(),
-            "level_db": [_number(level) for level in lines.level_db],
-            "rms_level_db": _number(float(lines.rms_level_db)),
-            "rms_output_level_db": _number(float(lines.rms_output_level_db)),
-            "rms_input_level_db": _number(float(lines.rms_input_level_db)),
+            "level_db": [known(level) for level in lines.level_db],
+            "rms_level_db": known(float(lines.rms_level_db)),
+            "rms_output_level_db": known(float(lines.rms_output_level_db)),
+            "rms_input_level_db": known(float(lines.rms_input_level_db)),
             "rms_noise_level_db": None
             if lines.rms_noise_level_db is None
-            else _number(float(lines.rms_noise_level_db)),
+            else known(float(lines.rms_noise_level_db)),
         }
         for name, lines in (("even", distortion.even), ("odd", distortion.odd))
     }
@@ -259,16 +259,7 @@ def _list(array: npt.NDArray[np.floating] | None) -> list | None:
 
 
 def _entry(values: npt.NDArray[np.floating] | None, k: int) -> float | None:
-    return None if values is None else _number(values[k])
-
-
-def _numbers(values: npt.NDArray[np.floating]) -> list[float | None]:
-    """Elements; null where one is not finite."""
-    return [_number(value) for value in values]
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return None if values is None else known(values[k])
 
 
 # Half width of the band in units of the resonance's own half width: wide enough to see the mode die

@@ -16,7 +16,7 @@ from tactile_resonance.calibration.contact_record import ContactRecord, Start
 from tactile_resonance.calibration.estimator import CalibratedEstimator
 from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
 from tactile_resonance.calibration.law import Law
-from tactile_resonance.fields import band, number, require, require_kind
+from tactile_resonance.fields import band, known, number, require, require_kind
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.result import Poles
@@ -117,7 +117,7 @@ def estimate_contact(
     """
     require_kind(recording, "recording", Recording)
     require_kind(sensor, "sensor", CalibratedSensor, str, Path)
-    known = sensor if isinstance(sensor, CalibratedSensor) else read_calibration(Path(sensor))
+    calibrated = sensor if isinstance(sensor, CalibratedSensor) else read_calibration(Path(sensor))
     realisations, periods, samples = recording.u.shape
     accepted = "two periods or more, or from_rest"
     require(from_rest or periods > 1, "periods", periods, accepted)
@@ -127,7 +127,7 @@ def estimate_contact(
     require(ratio > 0, "relaxed_ratio", ratio, "above 0")
     rate_hz = recording.sample_rate_hz
     if band_hz is None:
-        f = known.calibration.model.natural_rad_s / (2 * np.pi)
+        f = calibrated.calibration.model.natural_rad_s / (2 * np.pi)
         middle = f[(f > 100) & (f < 500)]
         require(middle.size > 0, "band_hz", None, "a band: no mode in air is from 100 to 500 Hz")
         band_hz = (BAND[0] * float(middle[0]), BAND[1] * float(middle[0]))
@@ -149,7 +149,7 @@ def estimate_contact(
     )
     lines = int(np.count_nonzero(record.excited))
     require(lines > 2, "band_hz", band_hz, f"a band of three excited lines or more ({lines} found)")
-    contact = CalibratedEstimator(known.calibration, known.tip_radius_m, Law(law))(
+    contact = CalibratedEstimator(calibrated.calibration, calibrated.tip_radius_m, Law(law))(
         record, force_n, force_std_n
     )
     black_box = None
@@ -187,16 +187,13 @@ def contact_content(analysis: ContactAnalysis) -> dict[str, Any]:
         "degrees_of_freedom": contact.degrees_of_freedom,
         "status": contact.status.value,
         "moduli": {
-            name: value if not isinstance(value, float) or np.isfinite(value) else None
-            for name, value in (
-                ("storage_pa", found.storage_pa),
-                ("storage_std_pa", found.storage_std_pa),
-                ("loss_pa", found.loss_pa),
-                ("loss_std_pa", found.loss_std_pa),
-                ("contact_radius_m", found.contact_radius_m),
-                ("radius_ratio", found.radius_ratio),
-                ("status", found.status.value),
-            )
+            "storage_pa": known(found.storage_pa),
+            "storage_std_pa": known(found.storage_std_pa),
+            "loss_pa": known(found.loss_pa),
+            "loss_std_pa": known(found.loss_std_pa),
+            "contact_radius_m": known(found.contact_radius_m),
+            "radius_ratio": known(found.radius_ratio),
+            "status": found.status.value,
         },
         "black_box": None,
         "warnings": list(analysis.warnings),

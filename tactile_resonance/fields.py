@@ -220,6 +220,11 @@ def _plain(value: Any) -> Any:
     return value.item() if getattr(value, "ndim", None) == 0 else value
 
 
+def known(value: float) -> float | None:
+    """The number; None, as JSON and YAML have it, where it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
 def numbers(value: Any, field: str, count: int | None = None) -> tuple[float, ...]:
     """Return a list, or an array (n,), of finite numbers as a tuple, of length `count` where that is given."""
     value = value.tolist() if getattr(value, "ndim", None) == 1 else value

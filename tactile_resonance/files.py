@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+_OF_FORMULAS = ("=", "@", "+", "-", "\t", "\r")
+"""A spreadsheet takes a text that begins so for a formula."""
 PART = ".part"
 """After the name of a file that is being written; whole where its writer was killed waiting for the disk."""
 
@@ -45,3 +49,20 @@ def write_whole(path: Path, content: bytes, written: Callable[[], None] | None =
     finally:
         if not told:
             part.unlink(missing_ok=True)
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Lines of a table: numbers with all their digits.
+
+    A text that a spreadsheet would take for a formula begins with an apostrophe.
+    """
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([_cell(value) for value in row] for row in rows)
+    return text.getvalue()
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return repr(float(value))
+    text = str(value)
+    return f"'{text}" if isinstance(value, str) and text.startswith(_OF_FORMULAS) else text

@@ -14,6 +14,7 @@ from tactile_resonance.calibration.model import PER_MODE, SINGLE, Calibration, S
 from tactile_resonance.fields import (
     check_above_zero,
     check_not_negative,
+    known,
     read_dataclass,
     read_yaml,
     require,
@@ -56,10 +57,10 @@ class CalibratedSensor:
             "format": FORMAT,
             **self.about,
             "tip_radius_m": self.tip_radius_m,
-            "tip_mass_kg": _or_none(self.tip_mass_kg),
-            "tip_mass_std_kg": _or_none(self.tip_mass_std_kg),
+            "tip_mass_kg": known(self.tip_mass_kg),
+            "tip_mass_std_kg": known(self.tip_mass_std_kg),
             "band_hz": list(made.band_hz),
-            "noise_v_per_root_hz": _or_none(made.noise_v_per_root_hz),
+            "noise_v_per_root_hz": known(made.noise_v_per_root_hz),
             "excess": made.excess,
             "message": made.message,
             **{name: getattr(model, name).tolist() for name in (*PER_MODE, *SINGLE)},
@@ -85,9 +86,9 @@ def read_calibration(path: Path) -> CalibratedSensor:
     form = content.get("format")
     accepted = f"{FORMAT!r}, as tactile_resonance calibrate writes it"
     require(form == FORMAT, f"{path}: format", form, accepted)
-    known = set(_File.__dataclass_fields__)
-    file = read_dataclass(_File, {k: v for k, v in content.items() if k in known}, f"{path.name}:")
-    about = {k: v for k, v in content.items() if k not in known and k != "format"}
+    own = set(_File.__dataclass_fields__)
+    file = read_dataclass(_File, {k: v for k, v in content.items() if k in own}, f"{path.name}:")
+    about = {k: v for k, v in content.items() if k not in own and k != "format"}
     nan = float("nan")
     model = SensorModel(
         *(np.asarray(getattr(file, name)) for name in PER_MODE),
@@ -109,10 +110,6 @@ def read_calibration(path: Path) -> CalibratedSensor:
         nan if file.tip_mass_std_kg is None else file.tip_mass_std_kg,
         about,
     )
-
-
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.files import write_whole
+from tactile_resonance.files import csv_text, write_whole
 
 if TYPE_CHECKING:
     from tactile_resonance.tissue.nominal_contact import NominalContact
@@ -127,20 +125,18 @@ def run(options: argparse.Namespace) -> int:
             f"  {k + 1}: {int(np.sum(groups.of_point == k))} points, f0 {mean[0]:.3f} +- {own[0]:.2g} Hz, "
             f"damping ratio {mean[1]:.5f} +- {own[1]:.2g}"
         )
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS)
+    table: list[list[object]] = [[*COLUMNS]]
     for k, (name, result) in enumerate(kept):
         group = int(groups.of_point[k])
-        table.writerow(
+        table.append(
             [
-                *(name, result.index, result.x_m, result.y_m, *(float(each) for each in x[k])),
-                *(float(found.p[k]), float(found.adjusted[k]), bool(found.differs[k]), group + 1),
-                float(groups.probability[k, group]),
+                *(name, result.index, result.x_m, result.y_m, *x[k]),
+                *(found.p[k], found.adjusted[k], bool(found.differs[k]), group + 1),
+                groups.probability[k, group],
                 "" if pairs is None else int(pairs[k].sum()),
             ]
         )
-    write_whole(options.output.with_name(options.output.name + ".csv"), text.getvalue().encode())
+    write_whole(options.output.with_name(options.output.name + ".csv"), csv_text(table).encode())
     position_m = np.array([result.position_m[:2] for _, result in kept])
     simulated = any(result.simulated for _, result in kept)
     figure = draw_comparison(position_m, x, noise, found, groups, simulated)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from tactile_resonance import msg
 from tactile_resonance.nodes.client import NodeClient
 from tactile_resonance.nodes.running import NEWEST, POINT_RESULTS, RESULTS, SERIES
@@ -21,14 +19,10 @@ class LiveListener(NodeClient):
     live : LiveRun
     namespace : str
         Of the nodes.
-    check : callable
-        Called while spinning; raises to end.
     """
 
-    def __init__(
-        self, live: LiveRun, namespace: str = "", check: Callable[[], None] = lambda: None
-    ) -> None:
-        super().__init__("live_page", check)
+    def __init__(self, live: LiveRun, namespace: str = "") -> None:
+        super().__init__("live_page", lambda: None)
         self._live = live
         self._prefix = f"{namespace.rstrip('/')}/" if namespace else ""
 

@@ -17,36 +17,31 @@ from tactile_resonance.poles.result import (
 BAND_MARGIN = 0.1
 
 
-def modes_in_band(
-    poles_rad_s: ComplexArray, band_hz: tuple[float, float], places: int | None = None
-) -> ComplexArray:
+def modes_in_band(poles_rad_s: ComplexArray, band_hz: tuple[float, float]) -> ComplexArray:
     """Of each complex pair near the band the pole above the real axis, by natural frequency.
 
     Parameters
     ----------
     poles_rad_s : (..., n) complex
     band_hz : (low, high)
-    places : int, optional
-        ``n // 2`` when absent.
 
     Returns
     -------
-    (..., places) complex
+    (..., n // 2) complex
         NaN from the last mode on.
     """
-    places = poles_rad_s.shape[-1] // 2 if places is None else places
+    places = poles_rad_s.shape[-1] // 2
     margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
     f0_hz = np.abs(poles_rad_s) / (2 * np.pi)
     inside = (
         (poles_rad_s.imag > 0) & (f0_hz >= band_hz[0] - margin) & (f0_hz <= band_hz[1] + margin)
     )
-    if poles_rad_s.shape[-1] == 2 and places == 1:
+    if poles_rad_s.shape[-1] == 2:
         first = inside[..., :1]
         taken = np.where(first, poles_rad_s[..., :1], poles_rad_s[..., 1:])
         return np.where(first | inside[..., 1:], taken, np.nan)
     order = np.argsort(np.where(inside, f0_hz, np.inf), axis=-1)[..., :places]
-    taken = np.take_along_axis(np.where(inside, poles_rad_s, np.nan), order, axis=-1)
-    return taken
+    return np.take_along_axis(np.where(inside, poles_rad_s, np.nan), order, axis=-1)
 
 
 def real_covariance(sensitivity: ComplexArray, parameters: FloatArray) -> FloatArray:

@@ -73,7 +73,6 @@ def identify_poles_from_bins(
     band_hz: tuple[float, float] | None = None,
     structure: ModelStructure | None = None,
     *,
-    input_noise_ratio: float | None = None,
     notes: Sequence[str] = (),
 ) -> Poles:
     """Poles from the bins that a stream of periods keeps; plans of the latest kinds are kept.
@@ -83,7 +82,7 @@ def identify_poles_from_bins(
     bins : BandBins
     band_hz : (low, high), optional
         Within that of the bins, which is taken when absent.
-    structure, input_noise_ratio
+    structure
         See `JointPlan`.
     notes : sequence of str
         Added to the message.
@@ -103,7 +102,7 @@ def identify_poles_from_bins(
         whole_harmonics(bins.harmonics).tobytes(),
         (float(band_hz[0]), float(band_hz[1])),
         structure or ModelStructure(),
-        input_noise_ratio,
+        None,
         bins.u.shape[0] > 1,
     )
     plan = plan_of(())

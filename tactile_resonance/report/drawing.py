@@ -62,18 +62,14 @@ def draw_ellipse(
     covariance: FloatArray,
     **style: Any,
 ) -> None:
-    """Ellipse that holds the truth with `PROBABILITY` if errors are Gaussian.
+    """The ellipse of a covariance (2, 2) about a centre (2,)."""
+    axes.plot(*(np.asarray(centre)[:, None] + ellipse(covariance, 100)), **style)
 
-    Parameters
-    ----------
-    centre : (2,) float
-    covariance : (2, 2) float
-    """
+
+def ellipse(covariance: FloatArray, points: int) -> FloatArray:
+    """(2, points) about 0: holds an error with `PROBABILITY` if it is Gaussian, of this covariance (2, 2)."""
     radius = np.sqrt(-2 * np.log1p(-PROBABILITY))  # chi-square with two degrees of freedom
     values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0, 2 * np.pi, 100)
-    circle = np.stack([np.cos(angle), np.sin(angle)])  # (2, 100)
-    points = np.asarray(centre)[:, None] + vectors @ (
-        radius * np.sqrt(np.maximum(values, 0))[:, None] * circle
-    )
-    axes.plot(*points, **style)
+    angle = np.linspace(0, 2 * np.pi, points)
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle))

@@ -14,11 +14,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from tactile_resonance.fields import known
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.page_data import (
     MN,
     frf_entry,
-    known,
     listed,
     map_entry,
     point_entry,

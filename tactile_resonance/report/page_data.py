@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
+from tactile_resonance.fields import known
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import array_of, complex_of
 from tactile_resonance.scan.level_set import Lines
@@ -53,17 +54,12 @@ def as_json(value: object) -> str:
     return text.translate(str.maketrans(escapes))
 
 
-def known(value: float) -> float | None:
-    """The number; None where it is not finite."""
-    return float(value) if math.isfinite(value) else None
-
-
 def listed(values: npt.ArrayLike, digits: int = _DIGITS) -> list[Any]:
     """Numbers of an array (...) with so many significant digits, None where one is not finite."""
     array = np.asarray(values, float)
     if array.ndim > 1:
         return [listed(row, digits) for row in array]
-    return [float(f"{x:.{digits}g}") if math.isfinite(x) else None for x in array.tolist()]
+    return [known(float(f"{x:.{digits}g}")) for x in array.tolist()]
 
 
 def point_entry(result: PointResult) -> dict[str, Any]:

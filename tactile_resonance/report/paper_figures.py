@@ -20,7 +20,7 @@ from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.recording.messages import array_of, complex_of
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.recording.store_recording import recording_of
-from tactile_resonance.report.drawing import PROBABILITY, decibel
+from tactile_resonance.report.drawing import PROBABILITY, decibel, ellipse
 from tactile_resonance.report.page_data import listed, s_plane
 from tactile_resonance.report.point_details import FRF_TYPE, PointDetails
 from tactile_resonance.scan.point_file import read_messages_of_type
@@ -226,15 +226,12 @@ def _loops(
     **more: Any,
 ) -> list[Trace]:
     """Ellipses of (f0, damping ratio) in the s-plane, as one trace."""
-    angle = np.linspace(0, 2 * np.pi, 37)
-    circle = np.sqrt(-2 * np.log1p(-PROBABILITY)) * np.stack([np.cos(angle), np.sin(angle)])
     loops = []
     for estimate, covariance in zip(estimates, covariances, strict=False):
         if not np.all(np.isfinite(covariance)):
             continue
         pole, slope = s_plane(*estimate)
-        values, vectors = np.linalg.eigh(slope @ covariance @ slope.T)
-        loop = vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle)
+        loop = ellipse(slope @ covariance @ slope.T, 37)
         loops += [loop + [[pole.real], [pole.imag]], np.full((2, 1), np.nan)]
     if not loops:
         return []

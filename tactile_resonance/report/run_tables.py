@@ -60,10 +60,9 @@ _TEXT = {
 }
 
 
-def paragraphs(lines: Iterable[str], mark: bool = False) -> str:
-    """One paragraph a text; marked: as a warning."""
-    css = ' class="mark"' if mark else ""
-    return "".join(f"<p{css}>{html.escape(line)}</p>" for line in lines)
+def paragraphs(lines: Iterable[str]) -> str:
+    """One paragraph a text."""
+    return "".join(f"<p>{html.escape(line)}</p>" for line in lines)
 
 
 def warning_list(lines: Sequence[str]) -> str:
@@ -104,12 +103,12 @@ def text_table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return table(names, [_row("td", names, row) for row in rows])
 
 
-def results_table(columns: Columns, results: Sequence[PointResult], run: int = 0) -> str:
-    """One row a result; a click on it shows the point of that run of the page."""
+def results_table(columns: Columns, results: Sequence[PointResult]) -> str:
+    """One row a result; a click on it shows the point of the page's first run."""
     names, rows = [name for name, _ in columns], []
     for result in results[: MOST_ROWS + 1]:
         css = "" if result.outcome is PointOutcome.DONE else ' class="failed"'
-        place = f'{css} data-run="{run}" data-point="{result.index}"'
+        place = f'{css} data-run="0" data-point="{result.index}"'
         rows.append(_row("td", names, [show(result) for _, show in columns], place))
     rows += [""] * (len(results) - len(rows))
     return table(names, rows)

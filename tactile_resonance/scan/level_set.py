@@ -21,7 +21,7 @@ from contourpy import LineType, contour_generator  # comes with matplotlib
 from scipy.special import ndtr, ndtri, owens_t
 
 from tactile_resonance._typing import BoolArray, FloatArray
-from tactile_resonance.fields import require
+from tactile_resonance.fields import known, require
 from tactile_resonance.scan.kriging import KrigedSurface, TiledSurface
 from tactile_resonance.scan.patterns import inside_polygon
 
@@ -143,10 +143,7 @@ class Boundary:
 
     def as_json(self) -> Mapping[str, Any]:
         """Plain values; a level that is infinite is null."""
-        low, high = (
-            level if math.isfinite(level) else None
-            for level in (self.level_set.low, self.level_set.high)
-        )
+        low, high = known(self.level_set.low), known(self.level_set.high)
         return {
             "f0_hz": [low, high],
             "probability": PROBABILITY,

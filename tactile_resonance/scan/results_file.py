@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from tactile_resonance.files import write_whole
+from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.scan.point_result import (
     BAND_COLUMNS,
@@ -22,8 +20,6 @@ from tactile_resonance.scan.point_result import (
 
 RESULTS = "results.csv"
 _DISTORTION_COLUMNS = tuple(field.name for field in fields(BandDistortion))[2:]
-# A spreadsheet takes a text that begins so for a formula.
-_OF_FORMULAS = ("=", "@", "+", "-", "\t", "\r")
 
 
 class ResultsFile:
@@ -55,7 +51,7 @@ class ResultsFile:
             self._write(latest())
             return
         with self._path.open("a", encoding="utf-8", newline="") as file:
-            file.write(_rows([_row(result, self._further, self._distortion)]))
+            file.write(csv_text([_row(result, self._further, self._distortion)]))
         self._last = result.index
 
     def _write(self, results: Sequence[PointResult]) -> None:
@@ -76,7 +72,7 @@ def as_csv(results: Iterable[PointResult]) -> str:
     numbers = [f"_{k + 1}" if k else "" for k in range(1 + max(further, distortion))]
     head = [f"{name}{n}" for n in numbers[1 : 1 + further] for name in BAND_COLUMNS]
     head += [f"distortion_{name}{n}" for n in numbers[:distortion] for name in _DISTORTION_COLUMNS]
-    return _rows([[*COLUMNS, *head], *(_row(result, further, distortion) for result in rows)])
+    return csv_text([[*COLUMNS, *head], *(_row(result, further, distortion) for result in rows)])
 
 
 def _widths(results: Sequence[PointResult]) -> tuple[int, int]:
@@ -85,7 +81,7 @@ def _widths(results: Sequence[PointResult]) -> tuple[int, int]:
     return further, max((len(result.distortion) for result in results), default=0)
 
 
-def _row(result: PointResult, further: int, distortion: int) -> list[str]:
+def _row(result: PointResult, further: int, distortion: int) -> list[object]:
     row = [getattr(result, name) for name in COLUMNS]
     for bands, names, count in (
         (result.further, BAND_COLUMNS, further),
@@ -93,21 +89,12 @@ def _row(result: PointResult, further: int, distortion: int) -> list[str]:
     ):
         for k in range(count):
             row += [getattr(bands[k], name) if k < len(bands) else NAN for name in names]
-    return [_cell(value) for value in row]
+    return [_plain(value) for value in row]
 
 
-def _rows(rows: Iterable[Sequence[str]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
-
-
-def _cell(value: object) -> str:
+def _plain(value: object) -> object:
     if isinstance(value, PointOutcome):
         return value.name.lower()
     if isinstance(value, PointKind):
         return value.value
-    if isinstance(value, float):
-        return repr(float(value))
-    text = str(value)
-    return f"'{text}" if isinstance(value, str) and text.startswith(_OF_FORMULAS) else text
+    return value

@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tactile_resonance.files import write_whole
+from tactile_resonance.fields import known
+from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.mechanics.fit import MOST_TERMS, fit_indentation
 from tactile_resonance.mechanics.indentation import IndentationRecord
 from tactile_resonance.mechanics.result import Fit
@@ -65,7 +64,7 @@ class TissueTest:
             "hold_s": fit.hold_s,
             "peak_force_n": fit.peak_force_n,
             "relaxed_share": fit.relaxed_share,
-            "modulus_pa": {f"{at:g}": [_known(value) for value in fit.modulus(at)] for at in AT_S},
+            "modulus_pa": {f"{at:g}": [known(value) for value in fit.modulus(at)] for at in AT_S},
             "equilibrium_pa": [
                 fit.equilibrium_pa,
                 fit.equilibrium_std,
@@ -87,14 +86,10 @@ class TissueTest:
             "dof": fit.dof,
             "bic": list(fit.bic),
             "contact_ratio": fit.contact_ratio,
-            "sphere_share": _known(fit.sphere_share),
-            "layer_share": _known(fit.layer_share),
+            "sphere_share": known(fit.sphere_share),
+            "layer_share": known(fit.layer_share),
             "status": list(fit.status),
         }
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def fitted(
@@ -149,11 +144,7 @@ def as_csv(tests: Sequence[TissueTest]) -> str:
     for k in range(1, most + 1):
         names = ("modulus_{}_pa", "modulus_{}_std", "time_{}_s", "time_{}_std", "known_{}")
         head += [name.format(k) for name in names]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*head, "status"])
-    writer.writerows(_row(one, most) for one in tests)
-    return text.getvalue()
+    return csv_text([[*head, "status"], *(_row(one, most) for one in tests)])
 
 
 def _row(one: TissueTest, most: int) -> list[object]:

@@ -42,6 +42,10 @@ class CanFrame(NamedTuple):
     data: bytes
 
 
+COMMAND_ID, RESPONSE_IDS = 0x64, (0x001, 0x002)
+"""Identifiers of the frames that it takes, and of those that it sends."""
+
+
 class LoadCell:
     """The cell, moved by whoever steps it.
 
@@ -50,10 +54,6 @@ class LoadCell:
     parameters : CellParameters
     seed : int
         Of its noise.
-    command_id : int
-        Identifier of the frames that it takes.
-    response_ids : tuple of 2 int
-        Identifiers of the frames that it sends.
 
     Attributes
     ----------
@@ -64,17 +64,10 @@ class LoadCell:
         Wrenches a second while it streams; 200 after power-up.
     """
 
-    def __init__(
-        self,
-        parameters: CellParameters,
-        seed: Seed = 1,
-        command_id: int = 0x64,
-        response_ids: tuple[int, int] = (0x001, 0x002),
-    ) -> None:
+    def __init__(self, parameters: CellParameters, seed: Seed = 1) -> None:
         self._transducer = Transducer(parameters, seed)
         self._model = parameters.name
-        self.command_id, self.response_ids = command_id, response_ids
-        self._next_ids = (command_id, *response_ids)
+        self._next_ids = (COMMAND_ID, *RESPONSE_IDS)
         self.streaming = False
         self._rate_code = self._filter_code = 0
         self._decimation = _decimation(0)
@@ -133,7 +126,7 @@ class LoadCell:
 
     def receive(self, can_id: int, data: bytes) -> list[CanFrame]:
         """Take one frame from the bus; return the answer, empty where the cell gives none."""
-        if can_id != self.command_id or not data or self.faults.silent:
+        if can_id != COMMAND_ID or not data or self.faults.silent:
             return []
         command = data[0]
         if self.streaming and command not in WHILE_STREAMING:
@@ -163,7 +156,7 @@ class LoadCell:
                 self._next_ids = (parameters[0], parameters[1], parameters[2])
             return _result(good)
         if command == READ_IDS:
-            return bytes([self.command_id, *self.response_ids, *self._next_ids])
+            return bytes([COMMAND_ID, *RESPONSE_IDS, *self._next_ids])
         if command == SET_FILTER:
             kind, code = parameters[:2]
             good = kind in (0, 1) and code < len(FILTERS_HZ)
@@ -196,7 +189,7 @@ class LoadCell:
     def _frames(self, response: bytes, time_s: float | None = None) -> list[CanFrame]:
         whole = response.ljust(16, b"\0")
         at = self._time_s or 0.0 if time_s is None else time_s
-        first, second = self.response_ids
+        first, second = RESPONSE_IDS
         return [CanFrame(at, first, whole[:8]), CanFrame(at, second, whole[8:])]
 
 
