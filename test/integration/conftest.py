@@ -2,6 +2,7 @@
 """Nodes as real processes in a domain of their own, on loopback."""
 
 import contextlib
+import os
 import socket
 import sys
 from pathlib import Path
@@ -14,18 +15,18 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 @contextlib.contextmanager
 def _fresh_domain():
-    """Environment of a domain that nobody else takes meanwhile: the port of its last participant is held."""
-    from tactile_resonance.processes import free_domain_id
+    """Environment of a domain that tests beside these do not take: a port of it is held meanwhile."""
+    from tactile_resonance.processes import domain_is_free
 
-    patching, holding = pytest.MonkeyPatch.context(), socket.socket(type=socket.SOCK_DGRAM)
-    with patching as patch, holding as held:
-        number = None
-        while number is None:
-            number = free_domain_id({})
-            try:
-                held.bind(("127.0.0.1", 7400 + 250 * (number + 1) - 2))
-            except OSError:  # tests that run beside these were faster
-                number = None
+    with pytest.MonkeyPatch.context() as patch, socket.socket() as held:
+        for step in range(100):
+            number = 1 + (os.getpid() + step) % 100
+            if domain_is_free(number):
+                with contextlib.suppress(OSError):
+                    held.bind(("127.0.0.1", 7400 + 250 * number))  # of TCP, which no node uses
+                    break
+        else:
+            raise RuntimeError("no ROS domain is free")
         patch.setenv("ROS_DOMAIN_ID", str(number))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         yield number

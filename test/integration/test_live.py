@@ -98,7 +98,9 @@ def test_it_shows_what_is_published_and_sends_nothing(live):
     assert set(forces) == {1e3 * 0.0098}
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=HANGS_S)
-    assert errors == "tactile_resonance: interrupted\n"
+    # Fast DDS reports a port of shared memory that a node beside these tests took at that moment, and goes on
+    own = [line for line in errors.splitlines() if "RTPS_TRANSPORT_SHM" not in line]
+    assert own == ["tactile_resonance: interrupted"]
     assert process.returncode == 130
 
 
