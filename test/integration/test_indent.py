@@ -67,7 +67,9 @@ def test_a_relaxation_is_carried_out_and_gives_the_modulus_of_the_tissue(bench, 
     assert std < 0.5
     # the beam unbends while the robot keeps its place: the ball goes on
     contact = (fit.time_s > fit.ramp_s) & (fit.time_s < 9)
-    assert np.all(np.diff(fit.indentation_m[contact]) > 0)
+    # means of five parts, for neighbours may differ by noise: 1 mN bends the beam by 68 um
+    parts = [part.mean() for part in np.array_split(fit.indentation_m[contact], 5)]
+    assert np.all(np.diff(parts) > 0)
 
 
 def test_what_lies_beyond_the_limits_is_refused_in_one_line(bench, client):
