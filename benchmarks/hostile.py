@@ -253,9 +253,9 @@ def _page(done: Sequence[Answers], flips: Mapping[str, Counter[str]]) -> str:
     lines = [
         "# Hostile inputs",
         "",
-        f"`tools/run.sh tactile_resonance benchmark hostile` (`--full`: a million). {about} Limits: "
-        f"{WITHIN_S:g} s ({PROCESS_WITHIN_S:g} s for .mat, whose reader is a process that has to start), "
-        f"{MEMORY_BYTES >> 30} GiB.",
+        "`tools/run.sh tactile_resonance benchmark hostile` (`--quick`: 5000 inputs, `--full`: a million). "
+        f"{about} Limits: {WITHIN_S:g} s ({PROCESS_WITHIN_S:g} s for .mat, whose reader is a process that has "
+        f"to start), {MEMORY_BYTES >> 30} GiB.",
         "",
         f"{sum(of.inputs for of in done)} inputs, {sum(of.accepted for of in done)} accepted. "
         f"**Wrong answers: {wrong}.**",
@@ -280,8 +280,9 @@ def _flips_table(flips: Mapping[str, Counter[str]]) -> list[str]:
     return [
         "## Flipped bits",
         "",
-        "One bit of one file. The file is refused; or the damage is named, and what was read from the file is "
-        "left out; or all that is read is equal to the last digit, samples included; else it is silent. Files "
+        "One bit of one file. The file is refused; or the damage is named, and a damaged recording counts as "
+        "if it were not there; or all that is read is equal to the last digit, samples included; else it is "
+        "silent. Files "
         "that follow from the recording (`results.csv`, `metadata.yaml`, those of `report`) hold no checksums, "
         "and the package does not read them.",
         "",

@@ -149,7 +149,8 @@ def _configuration(folder: Path) -> Iterable[Target]:
     for pattern, reader in {**CONFIGURATION, "nodes.yaml": read_parameter_file}.items():
         seeds = [path.read_bytes() for path in _config(pattern)]
         name = f"config/{pattern}"
-        yield Target(name, seeds, _file(folder / "configuration.yaml", reader), 0.005)
+        own = folder / f"{pattern.replace('/', '-').replace('*', 'all')}"  # readers run side by side
+        yield Target(name, seeds, _file(own, reader), 0.005)
     scenes = [path.read_bytes() for path in _config("scenes/*.yaml")]
     read_phantom = _file(folder / "phantom.yaml", lambda path: read_scene(library, path))
     yield Target("phantom of a scene", scenes, read_phantom, 0.005)
