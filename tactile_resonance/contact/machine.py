@@ -25,7 +25,7 @@ from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.outcome import Outcome
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.pressing import Pressing
-from tactile_resonance.contact.result import Breach, Cause, ContactResult
+from tactile_resonance.contact.result import Breach, Cause, ContactResult, NotIdleError
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.vectors import Vector, dot, vector
@@ -157,12 +157,13 @@ class ContactController:
 
         Raises
         ------
+        NotIdleError
+            If a contact is under way; nothing is changed then.
         ValueError
-            If a contact is under way, or parameters ask for more than the limits allow; nothing is
-            changed then.
+            If parameters ask for more than the limits allow; nothing is changed then.
         """
         if not self._free_for_goals:
-            raise ValueError(f"parameters: refused in state {self.state.value}; accepted in idle")
+            raise NotIdleError(f"parameters: refused in state {self.state.value}; accepted in idle")
         limits.check(parameters)
         if parameters.beam_stiffness_n_per_m != self.parameters.beam_stiffness_n_per_m:
             self._succeeded.clear()  # what was safe with one tip need not be with another
@@ -174,11 +175,13 @@ class ContactController:
 
         Raises
         ------
+        NotIdleError
+            If another is under way.
         ValueError
-            If another is under way, or the goal lies beyond the limits.
+            If the goal lies beyond the limits.
         """
         if not self._free_for_goals:
-            raise ValueError(f"goal: refused in state {self.state.value}; accepted in idle")
+            raise NotIdleError(f"goal: refused in state {self.state.value}; accepted in idle")
         p = self.parameters.lowered(goal.standoff_m, goal.press_speed_m_s)
         limits = self.limits
         limits.check(p)

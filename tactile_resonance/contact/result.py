@@ -39,6 +39,17 @@ class Cause(str, Enum):
     TIME = "time"
     HOLD_ENDED = "hold_ended"
     HELD = "held"
+    REFUSED = "refused"
+    BUSY = "busy"  # refused now, accepted once the tip is free
+
+
+class NotIdleError(ValueError):
+    """A contact is under way, or its tip is being drawn back: the same request is accepted later."""
+
+
+def refusal_cause(error: ValueError) -> Cause:
+    """Why a goal was refused that raised this."""
+    return Cause.BUSY if isinstance(error, NotIdleError) else Cause.REFUSED
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.result import ContactResult
+from tactile_resonance.contact.result import ContactResult, refusal_cause
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.mechanics.indentation import BallTip
 from tactile_resonance.nodes import contact_devices
@@ -277,7 +277,7 @@ class ContactNode(ManagedNode):
         except ValueError as error:
             self.health.error(f"refused: {error}")
             goal.abort()
-            raise _NotDoneError("refused", str(error)) from None
+            raise _NotDoneError(refusal_cause(error).value, str(error)) from None
         self._goal, self._finished = goal, Future()
         self._test = what if isinstance(what, IndentConduct) else None
         outcome: ContactResult | None = await self._finished

@@ -23,6 +23,7 @@ from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.result import Cause, NotIdleError, refusal_cause
 from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
@@ -166,16 +167,18 @@ class IdealContact:
     def _make(self, request: MakeContact.Goal) -> MakeContact.Result:
         """Bring the tip there, taking as long as a contact takes."""
         nan = math.nan
-        result = MakeContact.Result(cause="refused", force_n=nan, force_std_n=nan, depth_m=nan)
+        result = MakeContact.Result(force_n=nan, force_std_n=nan, depth_m=nan)
         result.stiffness_n_per_m = result.surface_m = result.surface_std_m = nan
         result.contact_s = result.total_s = result.peak_force_n = nan
         if not self._lock.acquire(blocking=False):
-            result.message = "goal: a contact is under way"
+            result.cause, result.message = Cause.BUSY.value, "goal: a contact is under way"
             return result
         try:
             self._drawn_back.clear()  # a stop after this is seen in the wait, one before in the refusal
-            result.message = self._refusal(request)
-            if result.message:
+            try:
+                self._check(request)
+            except ValueError as error:
+                result.cause, result.message = refusal_cause(error).value, str(error)
                 return result
             self._say(State.APPROACH, "", "")
             began_ns = self._now_ns()
@@ -206,18 +209,17 @@ class IdealContact:
         finally:
             self._lock.release()
 
-    def _refusal(self, request: MakeContact.Goal) -> str:
-        """Why a goal is refused; empty where it is accepted."""
+    def _check(self, request: MakeContact.Goal) -> None:
+        """Raise ``ValueError`` where a goal is refused."""
         frame = request.pose.header.frame_id
         if frame != self._base_frame:
-            return f"pose: in frame {frame!r}, accepted is {self._base_frame!r}"
+            raise ValueError(f"pose: in frame {frame!r}, accepted is {self._base_frame!r}")
         if not 0 < request.force_n < math.inf:
-            return f"force_n: {request.force_n:g}, accepted is above 0"
+            raise ValueError(f"force_n: {request.force_n:g}, accepted is above 0")
         if self._stop.stopped:
-            return "goal: refused while the tip is stopped"
+            raise ValueError("goal: refused while the tip is stopped")
         if self._state is not State.IDLE:
-            return f"goal: refused in state {self._state.value}; accepted in idle"
-        return ""
+            raise NotIdleError(f"goal: refused in state {self._state.value}; accepted in idle")
 
     def _wait(self, seconds: float) -> bool:
         """Let time pass; False where the tip is to be drawn back meanwhile."""

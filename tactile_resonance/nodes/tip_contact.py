@@ -48,7 +48,7 @@ FOREIGN_CAUSES = frozenset(
     cause.value
     for cause in (
         *(Cause.FORCE_SOURCE, Cause.FORCE_STALE, Cause.FORCE_INVALID),
-        *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK, Cause.CANCELLED),
+        *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK, Cause.CANCELLED, Cause.BUSY),
     )
 )
 

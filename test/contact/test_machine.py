@@ -19,7 +19,7 @@ from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.result import Cause, NotIdleError
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.plant.contact_bench import DISH_KG
@@ -109,9 +109,9 @@ def test_parameters_are_refused_in_contact_and_nothing_changes():
     made = started()
     assert made.run_until(State.HOLD)
     before = made.controller.parameters
-    with pytest.raises(ValueError, match="refused in state hold"):
+    with pytest.raises(NotIdleError, match="refused in state hold"):
         made.controller.configure(replace(before, approach_speed_m_s=1e-3), Limits())
-    with pytest.raises(ValueError, match="goal: refused in state hold"):
+    with pytest.raises(NotIdleError, match="goal: refused in state hold"):
         made.loop.start(made.goal)
     assert made.controller.parameters is before
     speed = np.abs(made.speed_m_s[-10:]).max()

@@ -50,7 +50,7 @@ def test_a_held_contact_takes_no_goal_and_no_parameters_and_is_drawn_back_when_t
     at_s = bench.order("truth")["time_s"]
     # the goal has ended, the contact goes on: another one is taken as a goal and refused as a contact
     answer = client.result(client.start())
-    assert (answer.reached, answer.cause) == (False, "refused")
+    assert (answer.reached, answer.cause) == (False, "busy")
     assert "hold" in answer.message
     for name, value in (
         ("contact__approach_speed_m_s", 1e-3),

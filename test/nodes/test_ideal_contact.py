@@ -241,7 +241,8 @@ def test_a_goal_in_another_frame_or_beside_another_contact_is_refused(ideal):
     assert "pose: in frame 'table', accepted is 'base'" in ideal.answer(future).result.message
     assert ideal.answer(ideal.make(goal_at())[1]).result.reached
     _, future = ideal.make(goal_at())
-    assert "goal: refused in state hold" in ideal.answer(future).result.message
+    refused = ideal.answer(future).result
+    assert (refused.cause, "goal: refused in state hold" in refused.message) == ("busy", True)
     assert ideal.state() == "hold"
 
 

@@ -25,8 +25,9 @@ NOT_OF_THE_POINT = (
     "arm_stale",
     "arm_link",
     "cancelled",
+    "busy",
 )
-OF_THE_POINT = ("force_hard", "force_abort", "force_overload", "surface_missing", "tilt")
+OF_THE_POINT = ("refused", "force_hard", "force_abort", "force_overload", "surface_missing", "tilt")
 
 
 @pytest.mark.parametrize("cause", [*NOT_OF_THE_POINT, *OF_THE_POINT])
