@@ -250,7 +250,10 @@ class FaultyScan(KilledScan):
                 continue
             result = self.result.result()
             safe = len(finished_points(self.run / "recording"))
-            if result.done + result.failed != safe:
+            if result.done is None:  # the client heard of it
+                far = f", {safe} of "
+                wrong += [] if far in result.message else [f"told {result.message}, {safe} are there"]
+            elif result.done + result.failed != safe:
                 wrong.append(f"told {result.done} points with poles, {safe} are there")
             if self.finished > index:
                 break

@@ -33,15 +33,17 @@ class ScanOutcome:
     ending : Ending
     message : str
         Why, in a sentence.
+    done, failed, skipped : int or None
+        None where scan_node went away: the run has them.
     """
 
     ending: Ending
     message: str
     run_directory: str = ""
     points: int = 0
-    done: int = 0
-    failed: int = 0
-    skipped: int = 0
+    done: int | None = 0
+    failed: int | None = 0
+    skipped: int | None = 0
     blocks: int = 0
     blocks_saved: int = 0
     saved_s: float = 0.0

@@ -67,14 +67,17 @@ class AskedGoal:
     handle: ClientGoalHandle | None = None
     cancelled: bool = False
     heard_s: float = 0.0
-    run_directory: str = ""  # of a scan, as heard
+    heard: Any = None  # the newest feedback
 
     def lost(self) -> Any:
         """Outcome where the server went away."""
-        if not self.run_directory:
+        run = getattr(self.heard, "run_directory", "")
+        if not run:
             return self.kind(Ending.LOST, "scan_node went away")
-        text = "scan_node went away; the run can be resumed"
-        return self.kind(Ending.LOST, text, run_directory=self.run_directory)
+        far = f"{self.heard.finished} of {self.heard.points} points were finished"
+        text = f"scan_node went away, {far}; the run can be resumed"
+        unknown = dict.fromkeys(("done", "failed", "skipped"))
+        return self.kind(Ending.LOST, text, run_directory=run, **unknown)
 
     def outcome(self, answer: Any) -> Any:
         """Outcome of the answer to the goal's result."""
@@ -87,7 +90,7 @@ class AskedGoal:
     def hear(self, message: Any) -> None:
         """Take a feedback."""
         self.heard_s = time.monotonic()
-        self.run_directory = getattr(message.feedback, "run_directory", "")
+        self.heard = message.feedback
         if self.on_feedback is not None:
             self.on_feedback(message.feedback)
 

@@ -26,6 +26,7 @@ from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import POLES, initialised
 from tactile_resonance.nodes.scan_node import ScanNode
 from tactile_resonance.processes import free_domain_id
+from tactile_resonance.scan.run_content import checksum_of
 from test.spinning import spin_until
 
 HERE = (Pose(),)
@@ -291,6 +292,8 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     # it can be resumed
     assert outcome.run_directory == heard[-1].run_directory
     assert Path(outcome.run_directory, "run.json").is_file()
+    assert f"{heard[-1].finished} of {heard[-1].points} points were finished" in outcome.message
+    assert (outcome.done, outcome.failed, outcome.skipped) == (None, None, None)
 
 
 def test_a_run_that_began_with_another_table_is_not_resumed(stack):
@@ -302,6 +305,7 @@ def test_a_run_that_began_with_another_table_is_not_resumed(stack):
     table = facts["facts"]["scan_node"]["table_in_base"]
     assert table == [0.0] * 6
     table[2] = 0.1
+    facts["crc32"] = checksum_of({key: facts[key] for key in facts if key != "crc32"})
     (run / "run.json").write_text(json.dumps(facts))
     outcome = stack.ended(stack.client.scan(run_directory="mine", resume=True))
     assert outcome.ending is Ending.REFUSED
