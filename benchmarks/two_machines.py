@@ -180,6 +180,8 @@ def on_two_machines(
     near = [*NEAR_NODES, *(["contact_node"] if robot_host else []), "scan_node"]
     job = Job(scene, folder, robot_host or HOST, real_time=real_time)
     parameters = node_parameters(job, False, folder)
+    # to count what was published
+    parameters["excitation_node"] = {**parameters["excitation_node"], "keep_all_records": True}
     parameters["manager_node"] = {"nodes": f"[{','.join([*near[:2], *FAR_NODES, *near[2:]])}]"}
     if not robot_host:
         without_robot(parameters)

@@ -314,7 +314,7 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     def check() -> None:
         ended.check()
         nodes.check()
-        if up and silence.lasts_s(client.heard["scan_node"]) > HUNG_AFTER_S:
+        if up and silence.lasts_s(client.reports["scan_node"]) > HUNG_AFTER_S:
             raise RuntimeError(f"scan_node hangs: it is silent for {HUNG_AFTER_S:g} s")
         state, _, reason = client.states.get("fake_hardware_node", "").partition(": ")
         if not up and state == "unconfigured" and reason:

@@ -132,7 +132,7 @@ class ScanClient(NodeClient):
     tactile : TactileClient
     states : dict
         The latest diagnostics of each node, by its name.
-    heard : Counter
+    reports : Counter
         How often each node has sent diagnostics.
     """
 
@@ -142,7 +142,7 @@ class ScanClient(NodeClient):
         super().__init__(name, check)
         self._namespace = namespace
         self.states: dict[str, str] = {}
-        self.heard: Counter[str] = Counter()
+        self.reports: Counter[str] = Counter()
         self._details: dict[str, dict[str, str]] = {}
 
     def join(self) -> None:
@@ -206,7 +206,7 @@ class ScanClient(NodeClient):
             if str(Path(status.name).parent) != self._node.get_namespace():
                 continue  # of another sensor
             name = Path(status.name).name
-            self.heard[name] += 1
+            self.reports[name] += 1
             self._details[name] = {value.key: value.value for value in status.values}
             # a node reports for seconds why it does not come up, then only that it has not
             refused = self.states.get(name, "").startswith(f"{status.message}: ")

@@ -101,7 +101,7 @@ class Bench:
         self.until(
             lambda: (
                 self.map_node._left_out
-                or last in {p.result.measurement_id for p in self.map_node._map.points}
+                or last in {p.result.measurement_id for p in self.map_node._grown.map.points}
             )
         )
 
@@ -165,7 +165,7 @@ def test_a_map_that_is_started_anew_gets_what_it_missed(bench):
     bench.map_node.trigger_deactivate()
     bench.map_node.trigger_cleanup()
     bench.map_node.trigger_configure()
-    bench.until(lambda: len(bench.map_node._map.points) == 4)
+    bench.until(lambda: len(bench.map_node._grown.map.points) == 4)
     bench.map_node.trigger_activate()
     assert bench.read(PointCloud2, "pole_map")[0].width == 4
 
@@ -346,7 +346,7 @@ def test_map_and_legend_are_in_the_view(bench, places, name):
     bench.send(*[poles(k, 0, 250.0 + k, place=(x, y, 0)) for k, (x, y) in enumerate(places)])
     bar, texts = bar_and_texts(bench.read(MarkerArray, "pole_map/legend")[0])
     (ellipses, _) = bench.read(MarkerArray, "pole_map/markers")[0].markers
-    size_m = bench.map_node._map.size_m
+    size_m = bench.map_node._grown.map.size_m
     assert size_m == pytest.approx(max(np.ptp(places), 0.02 if len(places) == 1 else 0))
     boxes = boxes_beside_the_bar(bar, texts, ellipses)
     low, high = (np.array(side) for side in zip(*boxes, strict=True))
@@ -401,7 +401,7 @@ def test_the_surface_covers_the_points_in_the_colours_of_the_legend(bench):
     assert np.all(corners[:, 2] < 0)  # below the ellipses
     assert np.all(corners[:, 2] > -1e-3)
     # the colour that the bar has at the same frequency
-    found = bench.map_node._map
+    found = bench.map_node._grown.map
     value = found.krige().predict(corners[:, :2])[0]
     bar_y, first = np.unique([p.y for p in bar.points], return_index=True)
     at = bar_y[0] + shares(value, found.f0_hz) * np.ptp(bar_y)
@@ -458,7 +458,7 @@ def test_only_what_a_scan_accepts_is_on_the_map(scanned):
         point_result(6, 0.020, 256.0),
     ):
         scanned.publisher.publish(message)
-    scanned.until(lambda: scanned.map_node._map.estimated)
+    scanned.until(lambda: scanned.map_node._grown.map.estimated)
     rows = table(scanned.read(PointCloud2, "pole_map")[0])
     assert list(rows["f0_hz"]) == [256.0]
     (markers,) = scanned.read(MarkerArray, "pole_map/markers")
@@ -484,8 +484,8 @@ def test_a_point_that_is_repeated_replaces_its_former_result(scanned, outcome, f
     # the tip comes down a millimetre beside: it is the same point
     scanned.publisher.publish(point_result(3, 0.0, f0_hz, outcome, off=0.001))
     scanned.publisher.publish(point_result(4, 0.1, 260.0))
-    scanned.until(lambda: 260.0 in [p.result.f0_hz for p in scanned.map_node._map.points])
-    found = [point.result.f0_hz for point in scanned.map_node._map.estimated]
+    scanned.until(lambda: 260.0 in [p.result.f0_hz for p in scanned.map_node._grown.map.points])
+    found = [point.result.f0_hz for point in scanned.map_node._grown.map.estimated]
     assert found == [*left, 260.0]
 
 
