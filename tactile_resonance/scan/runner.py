@@ -439,5 +439,5 @@ class ScanRunner:
 
 
 def _joined(text: str, more: str) -> str:
-    """Two reasons as one."""
-    return "; ".join(filter(None, (text, more)))
+    """Two reasons as one; the same one once."""
+    return "; ".join(dict.fromkeys(filter(None, (text, more))))

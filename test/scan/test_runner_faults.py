@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tactile_resonance.scan import runner
 from tactile_resonance.scan.hands import (
@@ -257,13 +258,19 @@ def test_what_cannot_go_on_ends_with_its_reason_and_the_tip_free(tmp_path):
     assert not bench.holding
 
 
-def test_a_tip_that_cannot_be_drawn_back_hides_neither_the_cause_nor_what_is_done(tmp_path):
+@pytest.mark.parametrize(
+    ("held", "told"),
+    [("the tip is held", "; the tip is held"), ("/contact_node is silent for 60 s", "")],
+)
+def test_a_tip_that_cannot_be_drawn_back_hides_neither_the_cause_nor_what_is_done(
+    tmp_path, held, told
+):
     class Held(Bench):
         gone = False
 
         def retract(self):
             if self.gone:
-                raise ScanEnded("the tip is held")
+                raise ScanEnded(held)
             return super().retract()
 
     def silent(bench, blocks):
@@ -272,7 +279,7 @@ def test_a_tip_that_cannot_be_drawn_back_hides_neither_the_cause_nor_what_is_don
             raise ScanEnded("/contact_node is silent for 60 s")
 
     summary, run, _ = scan(tmp_path / "run", scene(), Held(on_measure=silent))
-    assert summary.message == "/contact_node is silent for 60 s; the tip is held"
+    assert summary.message == f"/contact_node is silent for 60 s{told}"
     assert (summary.complete, summary.done) == (False, 2)
     assert run.next_point.index == 2
 
