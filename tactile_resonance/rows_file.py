@@ -118,7 +118,7 @@ class Rows:
                     raise ValueError("another version of its arrays")
                 shape, _, dtype = np.lib.format.read_array_header_2_0(file)
                 return cls(path, dtype, shape[0], file.tell())
-        except (KeyError, zipfile.BadZipFile, struct.error) as error:
+        except (KeyError, NotImplementedError, zipfile.BadZipFile, struct.error) as error:
             raise ValueError(f"{path}: damaged or foreign file ({error})") from error
 
     def read(self, start: int, stop: int) -> npt.NDArray:

@@ -100,6 +100,12 @@ def test_a_folder_of_stored_records_is_read_as_it_was_measured(tmp_path):
     np.testing.assert_array_equal(chosen.y[0, 0], others[0].sensor.volts())
 
 
+def test_a_file_whose_names_are_damaged_is_refused_in_one_line(tmp_path):
+    np.savez(tmp_path / "a.npz", **{"u\nv": np.zeros(8), "x" * 3000: np.zeros(8)})
+    with pytest.raises(ValueError, match=r"^u: got 'u'; accepted is .* holds u v, x+\.\.\.$"):
+        tr.read_record(tmp_path / "a.npz")
+
+
 def test_something_else_than_a_recording_is_refused():
     for call in (tr.estimate_frf, tr.identify_poles, tr.analyse):
         with pytest.raises(ValueError, match="got a str; accepted is a Recording"):

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.array_files import read_arrays
-from tactile_resonance.fields import require, whole
+from tactile_resonance.fields import cut, require, whole
 from tactile_resonance.recording.recording import Recording, make_recording
 
 _FIELDS = ("sample_rate_hz", "samples_per_period", "excited_harmonics", "time_s")
@@ -52,8 +52,8 @@ def read_recording(
     fields, names = read_arrays(path, {u, y, *_FIELDS})
     for option, name in (("u", u), ("y", y)):
         present = isinstance(name, str) and name in fields
-        held = f"an array of numbers in {path.name}, which holds {', '.join(sorted(names))}"
-        require(present, option, name, held)
+        held = cut(", ".join(sorted(names)))  # names may be damaged too
+        require(present, option, name, f"an array of numbers in {path.name}, which holds {held}")
     if sample_rate_hz is None:
         sample_rate_hz = _sample_rate(fields, path)
     if samples_per_period is None and "samples_per_period" in fields:

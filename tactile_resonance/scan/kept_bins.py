@@ -128,7 +128,10 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
             BinsKind(**{**kind, "harmonics": tuple(kind["harmonics"])}) for kind in content["kinds"]
         ]
         rows = [Rows.of(path, f"points_{k}") for k in range(len(kinds))]
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):  # damaged: it is made again
+    except (
+        *(ValueError, KeyError, TypeError, EOFError, NotImplementedError),
+        zipfile.BadZipFile,
+    ):  # damaged: it is made again
         return None
     within = low_hz <= band_hz[0] and band_hz[1] <= high_hz
     pairs = tuple(zip(kinds, rows, strict=True))

@@ -170,8 +170,14 @@ def test_bins_are_made_once_and_again_for_a_wider_band_or_when_the_run_has_grown
     command[-2:] = ["200", "300"]
     assert made()
     assert not made()
-    (run / "bins.npz").write_bytes((run / "bins.npz").read_bytes()[:-100])
+    whole = (run / "bins.npz").read_bytes()
+    (run / "bins.npz").write_bytes(whole[:-100])
     assert made()
+    for field in (6, 10):  # of the directory of a zip file: version needed, method of compression
+        damaged = bytearray(whole)
+        damaged[whole.rindex(b"PK\x01\x02") + field] = 99
+        (run / "bins.npz").write_bytes(damaged)
+        assert made()
     with RunDirectory.open(run) as again, again.begin_point(0) as recording:
         for k, (topic, name, message) in enumerate(measurement(102)):
             recording.write(topic, name, START_NS + k, to_cdr(message))
