@@ -13,7 +13,7 @@ ROWS = (
     "record to frf_node: duplicated",
     "poles to scan_node: duplicated",
     "record to frf_node: NaN",
-    "frf_node flooded",
+    "contact_state to scan_node: NaN",
     "poles_node killed",
 )
 
