@@ -39,8 +39,8 @@ load cell and sensor; nothing here is a measurement on hardware, and what a robo
 
 `tools/run.sh tactile_resonance benchmark faults` runs every row and writes this page; `--row poles_node`
 only the rows whose names hold that text, `--quick` a few. Rows that were not run again keep what they gave
-before (`benchmarks/faults.json`). Times are of a machine that had other work: they tell what is soon and what
-waits for a limit, no more. In CI `test/integration/test_faults.py` runs some of them.
+before (`benchmarks/faults.json`). Times are of a machine that had other work: they distinguish what is
+soon from what waits for a limit, no more. In CI `test/integration/test_faults.py` runs some of them.
 
 Each fault meets a scan that has finished a point, in the middle of the next one, and is judged from
 outside:
@@ -52,8 +52,8 @@ outside:
 - a command that ends early says so in one line, with how to go on, and leaves no process behind; `resume`
   then finishes all points.
 
-*Reported*: from the fault until the feedback of the scan, or the command, told of it; nothing where nothing
-had to be told. *Ended*: until the point, or of a command the process, had ended. A node is `hung` by
+*Reported*: from the fault until the feedback of the scan, or the command, reported it; empty where there was
+nothing to report. *Ended*: until the point, or of a command the process, had ended. A node is `hung` by
 SIGSTOP and `killed` by SIGKILL; it is `flooded` by a process that publishes on what it listens to, and asks
 for its services and goals, as fast as it can. Messages pass a relay, which drops, doubles, holds for
 {HELD_S:g} s or reorders them, or makes each of their floating point numbers NaN: one block of a

@@ -235,7 +235,7 @@ def _full(scene: Scene) -> Row:
     status, ended_s = command.end(), time.monotonic() - begun_s
     safe, said = _points(scene.run), command.last
     wrong = [] if status else ["a full disk is not noticed"]
-    for word in (str(scene.run), "No space left", f"{safe} points are safe", "resume"):
+    for word in (str(scene.run), "No space left", f"{safe} point{'' if safe == 1 else 's'}", "resume"):
         if word not in said:
             wrong.append(f"does not say {word!r}: {said}")
     _fill(filler)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands between the nodes, or talks to them out of turn: relays, floods, a second clock.
 
-``python -m benchmarks.faults_inject relay`` passes the topics of `HOPS` on, and does to them what it is told on
-its standard input; ``flood NODE`` sends to a node whatever it listens to, as fast as it can; ``clock``
+``python -m benchmarks.faults_inject relay`` passes the topics of `HOPS` on, and does to them what its standard
+input asks for; ``flood NODE`` sends to a node whatever it listens to, as fast as it can; ``clock``
 publishes a time that jumps; ``node COMMAND...`` runs a node that hears the relay.
 """
 
@@ -79,7 +79,7 @@ def _run_node(command: Sequence[str]) -> None:
 
 
 class _Relay:
-    """Passes one hop on; what it shall do to the next messages is told to it."""
+    """Passes one hop on; what it does to the next messages comes on its standard input."""
 
     def __init__(self, hop: Hop, node: Any, kind: type, qos: Any, out_qos: Any) -> None:
         self._hop, self._kind = hop, kind

@@ -232,7 +232,7 @@ class FaultyScan(KilledScan):
                     told_s = time.monotonic() - begun_s
             self._step(index)
         last = time.monotonic() + HEARD_WITHIN_S
-        while acted_s() is None and time.monotonic() < last:  # a result is told when its point is over
+        while acted_s() is None and time.monotonic() < last:  # a result is published when its point is over
             self.client.spin(0.02)
         at_s = acted_s()
         return lambda way_on="": self._row(name, index, at_s, told_s, way_on)

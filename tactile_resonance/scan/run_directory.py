@@ -379,6 +379,12 @@ def expected_bytes(points: int, design: MeasurementDesign) -> int:
     return points * (design.periods * block + 1_000_000)
 
 
+def ended_by_storage(path: Path, error: OSError, safe: int) -> str:
+    """Why a run ends that cannot be written, and how many of its points are safe."""
+    points = "1 point is" if safe == 1 else f"{safe} points are"
+    return f"{path}: {error.strerror or error}; {points} safe in it, resume goes on"
+
+
 def _plan_text(content: RunContent) -> bytes:
     """``run.json``; places only where there are some."""
     plan: dict[str, Any] = {

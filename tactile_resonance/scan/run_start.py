@@ -29,7 +29,7 @@ from tactile_resonance.scan.plan import Plan, plan_points
 from tactile_resonance.scan.preparation import prepare
 from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
+from tactile_resonance.scan.run_directory import RunDirectory, ended_by_storage, expected_bytes
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_run_scene
 from tactile_resonance.scan.standoff import Standoffs
@@ -152,9 +152,8 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
     try:
         run = RunDirectory.open(path)
     except OSError as error:  # the disk is still full
-        safe, reason = len(read_run(path).latest), error.strerror or error
-        text = f"run: {path}: {reason}; {safe} points are safe in it, resume goes on"
-        raise ValueError(text) from error
+        text = ended_by_storage(path, error, len(read_run(path).latest))
+        raise ValueError(f"run: {text}") from error
     try:
         facts = run.content.facts
         # where the table is known better now, that is another place

@@ -46,7 +46,7 @@ from tactile_resonance.scan.references import (
     read_reference,
     sensor_health,
 )
-from tactile_resonance.scan.run_directory import PointRecording, RunDirectory
+from tactile_resonance.scan.run_directory import PointRecording, RunDirectory, ended_by_storage
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import OnFailure, Output
 from tactile_resonance.tissue.nominal_contact import ContactLoad
@@ -134,9 +134,7 @@ class ScanRunner:
         except Interrupted:
             return "cancelled"
         except OSError as error:  # the disk is full, or gone
-            safe = self._run.finished
-            reason = error.strerror or error
-            return f"{self._run.path}: {reason}; {safe} points are safe in it, resume goes on"
+            return ended_by_storage(self._run.path, error, self._run.finished)
         return ""
 
     def _next(self) -> ScanPoint | None:
