@@ -10,9 +10,11 @@ import os
 import textwrap
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import redirect_stdout
+from contextlib import ExitStack, closing, redirect_stdout
 from dataclasses import dataclass, replace
 from io import StringIO
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -61,8 +63,8 @@ class Part:
         (``results.csv``, and the bag's metadata, which are a mean), and beside it what a map node does.
     drawn_ms : tuple of float
         Processor time of one cloud, one array of markers, one surface [ms].
-    memory_mb : float
-        Resident at its end, before the map is drawn.
+    memory_mb, map_mb : float
+        Resident at its end [MB]: of the scan, and of the process with the map before it is drawn.
     files : int
         Open at its end.
     """
@@ -75,6 +77,7 @@ class Part:
     map_ms: float
     drawn_ms: tuple[float, ...]
     memory_mb: float
+    map_mb: float
     files: int
 
 
@@ -109,23 +112,51 @@ def memory_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def map_node(pipe: Connection) -> None:
+    """Take serialised results as a map node does; at an empty one answer what they took and what drawing takes.
+
+    The answer is the median processor time of a result [ms], that of each drawing [ms], and the memory [MB].
+    """
+    grown, times_ms = GrowingMap(), []
+    while True:
+        try:
+            cdr = pipe.recv_bytes()
+        except EOFError:
+            return
+        if cdr:
+            begun_s = time.process_time()
+            grown.take(from_message(message_types().deserialize_cdr(cdr, TYPE)))
+            times_ms.append(1e3 * (time.process_time() - begun_s))
+            continue
+        held_mb = memory_mb()
+        pipe.send((float(np.median(times_ms)), tuple(drawn_ms(grown.map)), held_mb))
+        times_ms.clear()
+
+
 class Course:
-    """Takes a scan's results as a map node does, and notes what each point took, in parts of so many."""
+    """Notes what each point of a scan took, in parts of so many; the results go to a process that maps them."""
 
     def __init__(self, each: int) -> None:
         self._each, self.before = each, 0
         self._times: list[tuple[float, ...]] = []
-        self.map_s = 0.0
-        self.grown = GrowingMap()
         self.parts: list[Part] = []
+        spawning = get_context("spawn")
+        self._map, far = spawning.Pipe()
+        spawning.Process(target=map_node, args=(far,), daemon=True).start()
+        far.close()
+
+    def close(self) -> None:
+        """End the process of the map."""
+        self._map.close()
+
+    def show(self, cdr: bytes) -> None:
+        """Hand a result to the map."""
+        self._map.send_bytes(cdr)
 
     def take(self, cdr: bytes, *others_s: float) -> None:
         """After a point; clocks of the scan beside those of this process [s]."""
-        begun_s = time.process_time()
-        self.grown.take(from_message(message_types().deserialize_cdr(cdr, TYPE)))
-        self.map_s += time.process_time() - begun_s
-        clocks_s = time.perf_counter(), time.process_time() - self.map_s, *others_s, self.map_s
-        self._times.append(clocks_s)
+        self.show(cdr)
+        self._times.append((time.perf_counter(), time.process_time(), *others_s))
         if len(self._times) == self._each:
             self._end_part()
             self._times.clear()
@@ -133,12 +164,13 @@ class Course:
     def _end_part(self) -> None:
         files, held_mb = len(os.listdir("/proc/self/fd")), memory_mb()
         steps_ms = 1e3 * np.diff(self._times, axis=0)  # (points - 1, clocks)
-        wall, point, poles, _, on_map = np.median(steps_ms, axis=0).tolist()
+        wall, point, poles, _ = np.median(steps_ms, axis=0).tolist()
         summary = float(np.mean(steps_ms[:, 3]))
-        drawn = tuple(drawn_ms(self.grown.map))
+        self._map.send_bytes(b"")
+        on_map, drawn, map_mb = self._map.recv()
         self.before += self._each
         figures = wall, point, poles, summary, on_map
-        self.parts.append(Part(self.before, *figures, drawn, held_mb, files))
+        self.parts.append(Part(self.before, *figures, drawn, held_mb, map_mb, files))
         print(self.parts[-1], flush=True)
 
 
@@ -157,14 +189,14 @@ def drawn_ms(pole_map: PoleMap) -> Iterator[float]:
 
 def run(output: Path, quick: bool, points: int = POINTS) -> str:
     """Scan, resume, read, report; write ``endurance.md`` into `output`, and return the page."""
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, ExitStack() as stack:
         path, target = Path(folder) / "scene.yaml", Path(folder) / "run"
         text = dump_yaml(content(points))
         path.write_text(text)
         plan = make_plan(read_scan_scene(path))
         hands = VirtualHands(read_scene(read_tissues(), path), 1.2)
         count = len(plan.points)
-        course = Course(max(2, count // (QUICK if quick else PARTS)))
+        course = stack.enter_context(closing(Course(max(2, count // (QUICK if quick else PARTS)))))
 
         def scan(made: TimedRun, until: int) -> None:
             controls = Controls()
@@ -180,7 +212,8 @@ def run(output: Path, quick: bool, points: int = POINTS) -> str:
         scan(TimedRun.create(target, text, plan.points, {"seed": 1}), 1 if quick else PARTS)
         if quick:
             course.before = fill(target, count - count // QUICK)
-            course.grown = GrowingMap(read_run(target).latest)
+            for result in read_run(target).latest:
+                course.show(serialised(result))
             scan(TimedRun.open(target), 2)
         size_mb = sum(file.stat().st_size for file in target.rglob("*") if file.is_file()) / 1e6
         clocks_s = []
@@ -221,7 +254,8 @@ def _page(
 ) -> str:
     rows = [
         f"| {p.points} | {p.wall_ms:.1f} | {p.point_ms:.1f} | {p.poles_ms:.1f} | {p.summary_ms:.2f} | "
-        f"{p.map_ms:.2f} | {' | '.join(f'{ms:.0f}' for ms in p.drawn_ms)} | {p.memory_mb:.0f} | {p.files} |"
+        f"{p.map_ms:.2f} | {' | '.join(f'{ms:.0f}' for ms in p.drawn_ms)} | "
+        f"{p.memory_mb:.0f} | {p.map_mb:.0f} | {p.files} |"
         for p in parts
     ]
     first, last = parts[0], parts[-1]
@@ -236,9 +270,9 @@ def _page(
             "",
             *(textwrap.wrap(FILLED, 112) + [""] if quick else []),
             *textwrap.wrap(
-                "Simulated, in virtual time and one process: the runner, the folder and the estimator as "
-                "scan_node, frf_node and poles_node use them; no robot, no nodes (those: "
-                "[on the wall clock](endurance_hour.md)). Medians over each "
+                "Simulated, in virtual time: the runner, the folder and the estimator in one process, as "
+                "scan_node, frf_node and poles_node use them, and the map in another, as in pole_map_node; "
+                "no robot, no nodes (those: [on the wall clock](endurance_hour.md)). Medians over each "
                 "tenth of processor times, which other work on the machine changes little, and of its "
                 "clock, which it does change. Summaries are the row of `results.csv` and, after each "
                 "twentieth of the points, the bag's metadata: their mean. Map: what a map node does with "
@@ -248,13 +282,15 @@ def _page(
             ),
             "",
             "| points | a point, clock [ms] | processor [ms] | of it poles [ms] | of it summaries [ms] | "
-            "map [ms] | cloud [ms] | markers [ms] | surface [ms] | memory [MB] | open files |",
-            "|" + "---:|" * 11,
+            "map [ms] | cloud [ms] | markers [ms] | surface [ms] | memory [MB] | "
+            "memory, map [MB] | open files |",
+            "|" + "---:|" * 12,
             *rows,
             "",
             *textwrap.wrap(
                 f"Last tenth over first: point {ratios[0]:.2f}, map {ratios[1]:.2f}, summaries "
-                f"{ratios[2]:.2f}; memory {last.memory_mb - first.memory_mb:+.0f} MB.",
+                f"{ratios[2]:.2f}; memory {last.memory_mb - first.memory_mb:+.0f} MB, "
+                f"of the map's process {last.map_mb - first.map_mb:+.0f} MB.",
                 112,
             ),
             "",
