@@ -90,9 +90,16 @@ class Goals:
     pause: Callable[[float], None] = time.sleep
 
     def send(
-        self, goal: Any, check: Check, poll: Poll, feedback: Callable[[Any], None] | None = None
+        self,
+        goal: Any,
+        check: Check,
+        poll: Poll,
+        feedback: Callable[[Any], None] | None = None,
+        refused: Callable[[], None] = lambda: None,
     ) -> ClientGoalHandle:
         """Send a goal until it is accepted; waits for a node that is being brought back.
+
+        `refused` is called after each refusal: nothing of this goal is under way then.
 
         Raises
         ------
@@ -107,9 +114,10 @@ class Goals:
             if not self.client.server_is_ready():
                 self.pause(REFUSED_AGAIN_S)
                 continue
-            handle = self._send(goal, check, poll, feedback)
+            handle = self._send(goal, check, poll, feedback, deadline)
             if handle is not None:
                 return handle
+            refused()
             self.pause(REFUSED_AGAIN_S)
         raise ScanEnded(f"{self.name}: no node takes the goal for {TAKEN_WITHIN_S:g} s")
 
@@ -134,11 +142,16 @@ class Goals:
         return future.result().result
 
     def _send(
-        self, goal: Any, check: Check, poll: Poll, feedback: Callable[[Any], None] | None
+        self,
+        goal: Any,
+        check: Check,
+        poll: Poll,
+        feedback: Callable[[Any], None] | None,
+        deadline: float,
     ) -> ClientGoalHandle | None:
-        """Handle of a goal that was accepted; None where it was refused."""
+        """Handle of a goal that was accepted; None where it was refused, or not answered in time."""
         with contextlib.closing(offer(self.client, goal, feedback)) as waiting:
-            while True:
+            while time.monotonic() < deadline:
                 try:
                     next(waiting)
                 except StopIteration as answered:
@@ -148,6 +161,7 @@ class Goals:
                 poll()
                 check()
                 self.pause(POLL_S)
+        return None
 
     def _done(self, future: Future, timeout_s: float) -> bool:
         """Wait for it; whether it came."""

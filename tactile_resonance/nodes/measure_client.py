@@ -146,7 +146,8 @@ class MeasureClient:
         while True:
             # once before the measurement and once after each block: every block that is handed over ends it
             self._time.go()
-            handle = self._goals.send(goal, check, poll)
+            # refused while somebody else measures, whose blocks end a go too
+            handle = self._goals.send(goal, check, poll, refused=self._time.go)
             result = self._goals.follow(handle, check, each_poll)
             if result.outcome != Measure.Result.NOT_READY or time.monotonic() > deadline:
                 break

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Iterator
 
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.nodes.node_watch import SILENT_S
+
+GO_AGAIN_S = 0.2
 
 
 class ScanTime:
@@ -36,6 +39,7 @@ class ScanTime:
         self.simulated = bool(server)
         self.silent_s = hung_after_s if server else SILENT_S
         self._clock: SimulatedClock | None = None
+        self._gone_s = -math.inf
         self._offset_ns = self._last_ns = 0  # a bench that is restarted begins its time anew
 
     @contextlib.contextmanager
@@ -70,10 +74,16 @@ class ScanTime:
 
     def go(self) -> None:
         """Let time go on while something needs it, until a device hands a result over."""
+        self._gone_s = time.monotonic()
         if not self.simulated:
             return
         with self._while_there():
             (self._clock or self._join()).go()
+
+    def keep_going(self) -> None:
+        """`go` again from time to time, where no result is awaited: somebody else's measurement ends a go."""
+        if time.monotonic() - self._gone_s > GO_AGAIN_S:
+            self.go()
 
     def seed(self, *integers: int) -> None:
         """Let the noise of the bench follow from integers, three at most, from now on."""

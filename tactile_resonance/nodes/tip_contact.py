@@ -130,7 +130,7 @@ class TipContact:
         self._low = math.isfinite(standoff_m)
         goal.standoff_m = standoff_m if self._low else 0.0
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
-        result = self._make(goal, check, poll)
+        result, poll = self._make(goal, check, poll), self._going(poll)
         while (state := self._state) is None or state.state != state.STATE_HOLD:
             poll()
             check()
@@ -242,7 +242,17 @@ class TipContact:
         self._state = None
         self._times.begin()
         self._time.go()
+        poll = self._going(poll)
         return goals.follow(goals.send(goal, check, poll), check, poll)
+
+    def _going(self, poll: Poll) -> Poll:
+        """The same, and time goes on."""
+
+        def both() -> None:
+            poll()
+            self._time.keep_going()
+
+        return both
 
     def _ask_to_retract(self) -> bool:
         """Whether contact_node takes the request; states from before its answer do not count."""

@@ -217,11 +217,16 @@ def test_a_goal_whose_node_goes_away_before_it_answers_is_cancelled_where_it_was
     assert node.running == []
 
 
-def test_a_goal_that_nobody_takes_ends_the_scan(taken):
-    node, goals = taken(dict.fromkeys(range(10000), REFUSED))
+@pytest.mark.parametrize("answer", [REFUSED, LOST])
+def test_a_goal_that_nobody_takes_ends_the_scan(taken, answer):
+    node, goals = taken(dict.fromkeys(range(10000), answer))
     with pytest.raises(ScanEnded, match="measure: no node takes the goal for 60 s"):
         goals.send("goal", nothing, nothing)
     assert node.now_s == pytest.approx(TAKEN_WITHIN_S, abs=0.1)
+    assert node.running == []
+
+
+def test_no_goal_is_sent_while_its_node_is_away(taken):
     node, goals = taken()
     node.up = False
     with pytest.raises(ScanEnded):

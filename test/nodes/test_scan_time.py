@@ -3,6 +3,7 @@
 
 import contextlib
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,6 +16,8 @@ from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.nodes.bench_player import BenchServer
 from tactile_resonance.nodes.node_watch import SILENT_S
 from tactile_resonance.nodes.scan_time import ScanTime
+from tactile_resonance.nodes.tip_contact import TipContact
+from tactile_resonance.scan.point_times import StateTimes
 
 SERVER = own_time(41)
 BLOCK_NS = 400_000_000
@@ -64,6 +67,24 @@ def test_while_a_scan_conducts_each_go_lets_one_block_pass():
         begun_ns, begun_s = clock.ask_ns(), time.monotonic()
         while clock.ask_ns() == begun_ns:  # nobody conducts: at its own pace
             assert time.monotonic() < begun_s + 60.0
+
+
+def test_blocks_of_somebody_else_do_not_stop_the_time_of_a_contact():
+    scan, ends = ScanTime(SERVER, 60.0), patience()
+    tip = TipContact.__new__(TipContact)
+    tip._time, tip._times, tip._state, tip.touching = scan, StateTimes(), None, False
+    with device() as clock, scan.conducted():
+        begun_ns = clock.ask_ns()
+
+        def follow(goal, check, poll):
+            for n in (1, 2, 3):
+                clock.hold(begun_ns + n * BLOCK_NS, Demand.FAST)
+                clock.wait_told(lambda: (ends(), poll()))
+                assert stands(scan)
+            return "reached"
+
+        goals = SimpleNamespace(send=lambda goal, check, poll: goal, follow=follow)
+        assert tip._sent(goals, "goal", ends, lambda: None) == "reached"
 
 
 def test_time_of_a_scan_never_goes_back_though_a_bench_begins_anew():
