@@ -2,7 +2,8 @@
 """Hostile inputs to all readers: each is read, or refused in one line, in time.
 
 Inputs are whole examples, changed at random: bits, bytes, numbers, pieces left out, doubled or taken from
-elsewhere. An input whose answer is new becomes an example too, so that what was reached is gone on from.
+elsewhere. An input whose answer is new, or which takes a step from one line of the package to another that none
+before it took, becomes an example too, so that what was reached is gone on from.
 An answer is wrong if it is an exception that is neither ``ValueError`` nor ``OSError``, or of more than one
 line, if it takes too long, needs more memory than allowed, or ends the process.
 """
@@ -15,18 +16,22 @@ import os
 import re
 import resource
 import signal
+import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import CodeType, FrameType
+from typing import Any
 
 import numpy as np
 
+import tactile_resonance
 from benchmarks.hostile_flips import FLIPS, QUICK_FLIPS, flipped_bits
 from benchmarks.hostile_targets import PROCESS_WITHIN_S, WITHIN_S, Target, targets
 from benchmarks.hostile_wire import wire_targets
@@ -36,7 +41,8 @@ MEMORY_BYTES = 6 << 30
 TOO_LONG, REPEATS = "no answer in time", 2
 LONGEST_LINE = 1200
 LONGEST_INPUT = 1 << 16
-MOST_EXAMPLES = 300
+MOST_EXAMPLES = 2000
+PACKAGE = str(Path(tactile_resonance.__file__).parent)
 SEED = 1
 NUMBERS = tuple(b"0 -1 1e999 nan .inf -.inf 010 1:30 1e-320 null true".split()) + (b"9" * 40,)
 PIECES = (
@@ -61,6 +67,8 @@ class Answers:
     longest_s : float
     kinds : set of str
         Answers without their numbers and names.
+    steps : int
+        Different steps from a line of the package to another.
     wrong : dict of str to bytes
         Wrong answers, and an input of each.
     """
@@ -70,7 +78,36 @@ class Answers:
     accepted: int = 0
     longest_s: float = 0.0
     kinds: set[str] = field(default_factory=set)
+    steps: int = 0
     wrong: dict[str, bytes] = field(default_factory=dict)
+
+
+class Steps:
+    """Steps from one line of the package to another, of what runs in this thread in the context."""
+
+    def __init__(self) -> None:
+        self.known: set[tuple[CodeType, int, int]] = set()
+        self._last = 0
+
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        """Note them."""
+        self._last = 0
+        sys.settrace(self._called)
+        try:
+            yield
+        finally:
+            sys.settrace(None)
+
+    def _called(self, frame: FrameType, event: str, of: Any) -> Callable[..., Any] | None:
+        # what libraries do is not followed: it would take most of the time
+        return self._stepped if frame.f_code.co_filename.startswith(PACKAGE) else None
+
+    def _stepped(self, frame: FrameType, event: str, of: Any) -> Callable[..., Any]:
+        line = frame.f_lineno
+        self.known.add((frame.f_code, self._last, line))
+        self._last = line
+        return self._stepped
 
 
 def changed(data: bytes, examples: list[bytes], rng: np.random.Generator) -> bytes:
@@ -159,17 +196,20 @@ def kind_of(text: str) -> str:
 
 def tried(target: Target, inputs: int, seed: int, last: mmap.mmap) -> Answers:
     """Try a reader; the newest input stands in `last`, where it outlives this process."""
-    rng, found = np.random.default_rng(seed), Answers(target.name)
+    rng, found, steps = np.random.default_rng(seed), Answers(target.name), Steps()
     examples = list(target.seeds)
     for data in examples:  # what the reader refuses as it is would show nothing
-        if refusal := answer(target, data)[0]:
+        with steps.noted():
+            refusal = answer(target, data)[0]
+        if refusal:
             found.wrong[f"an example is refused: {refusal}"] = data
     for _ in range(inputs):
         data = changed(examples[int(rng.integers(len(examples)))], examples, rng)
         last[:8] = len(data).to_bytes(8, "little")
         last[8 : 8 + len(data)] = data
-        begun_s = _own_s()
-        text, right = answer(target, data)
+        begun_s, before = _own_s(), len(steps.known)
+        with steps.noted():
+            text, right = answer(target, data)
         found.longest_s = max(found.longest_s, _own_s() - begun_s)
         for _ in range(REPEATS if text == TOO_LONG else 0):  # the machine may be busy
             if text == TOO_LONG:
@@ -179,10 +219,11 @@ def tried(target: Target, inputs: int, seed: int, last: mmap.mmap) -> Answers:
         kind = kind_of(text)
         if not right:
             found.wrong.setdefault(kind, data)
-        elif kind not in found.kinds:
+        elif kind not in found.kinds or len(steps.known) > before:
             found.kinds.add(kind)
             if len(examples) < MOST_EXAMPLES:
                 examples.append(data)
+    found.steps = len(steps.known)
     return found
 
 
@@ -260,11 +301,11 @@ def _page(done: Sequence[Answers], flips: Mapping[str, Counter[str]]) -> str:
         f"{sum(of.inputs for of in done)} inputs, {sum(of.accepted for of in done)} accepted. "
         f"**Wrong answers: {wrong}.**",
         "",
-        "| reader | inputs | accepted | kinds of refusals | longest [s] | wrong |",
-        "|---|---:|---:|---:|---:|---:|",
+        "| reader | inputs | accepted | kinds of refusals | steps | longest [s] | wrong |",
+        "|---|---:|---:|---:|---:|---:|---:|",
         *(
-            f"| {of.name} | {of.inputs} | {of.accepted} | {len(of.kinds - {''})} | {of.longest_s:.2f} | "
-            f"{len(of.wrong)} |"
+            f"| {of.name} | {of.inputs} | {of.accepted} | {len(of.kinds - {''})} | {of.steps} | "
+            f"{of.longest_s:.2f} | {len(of.wrong)} |"
             for of in done
         ),
         "",
