@@ -20,7 +20,7 @@ from rclpy.task import Future
 from tactile_resonance.action import Scan
 from tactile_resonance.msg import PointResult
 
-from tactile_resonance.client import Ending, ScanOutcome, TactileClient
+from tactile_resonance.client import CalibrationOutcome, Ending, ScanOutcome, TactileClient
 from tactile_resonance.nodes import goal_conduct, scan_node
 from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import POLES, initialised
@@ -292,8 +292,16 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     # it can be resumed
     assert outcome.run_directory == heard[-1].run_directory
     assert Path(outcome.run_directory, "run.json").is_file()
-    assert f"{heard[-1].finished} of {heard[-1].points} points were finished" in outcome.message
+    far = f"{heard[-1].finished} of {heard[-1].points} points were finished"
+    assert outcome.message == f"scan_node went away, {far}; the run can be resumed"
     assert (outcome.done, outcome.failed, outcome.skipped) == (None, None, None)
+
+
+@pytest.mark.parametrize("kind", [ScanOutcome, CalibrationOutcome])
+def test_a_goal_whose_node_goes_away_before_a_run_is_lost_without_one(kind):
+    asked = goal_conduct.AskedGoal(None, kind, {}, None, wait_s=1.0, on_feedback=None)
+    lost = asked.lost()
+    assert (type(lost), lost.ending, lost.message) == (kind, Ending.LOST, "scan_node went away")
 
 
 def test_a_run_that_began_with_another_table_is_not_resumed(stack):

@@ -10,6 +10,7 @@ import rclpy
 
 from tactile_resonance.commands import bench_scan
 from tactile_resonance.commands.bench_scan import Silence, require_own_domain
+from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import domain_is_free, free_domain_id
 
@@ -18,7 +19,9 @@ from tactile_resonance.processes import domain_is_free, free_domain_id
     ("name", "namespace", "refused"),
     [("scan_node", "", True), ("scan_node", "/left", False), ("rviz", "", False)],
 )
-def test_a_domain_with_nodes_of_another_session_is_refused(monkeypatch, name, namespace, refused):
+def test_a_domain_with_nodes_of_another_session_is_refused(
+    monkeypatch, tmp_path, name, namespace, refused
+):
     domain = free_domain_id({})
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -31,6 +34,12 @@ def test_a_domain_with_nodes_of_another_session_is_refused(monkeypatch, name, na
                 ValueError, match=rf"ROS_DOMAIN_ID: {domain} has scan_node of another"
             ):
                 require_own_domain()
+            # before anything is started, whose nodes would be among those of the other session
+            monkeypatch.setattr(bench_scan, "NodeProcesses", None)
+            job = bench_scan.Job(share_path("config/scenes/demo.yaml"), tmp_path / "run", "127.0.0.1")
+            with pytest.raises(ValueError, match=r"^ROS_DOMAIN_ID: "):
+                bench_scan.run_job(job)
+            assert not any(tmp_path.iterdir())
         else:
             require_own_domain()
         node.destroy_node()
