@@ -192,8 +192,8 @@ class RunDirectory:
         Raises
         ------
         ValueError
-            If it is no run, its plan is damaged, another process is recording it, or its messages are of
-            another version: no reader takes two definitions of one type in one bag.
+            If it is no run, its plan or scene was changed, another process is recording it, or its messages
+            are of another version: no reader takes two definitions of one type in one bag.
         """
         path = Path(path)
         lock = _lock(path)
@@ -201,6 +201,11 @@ class RunDirectory:
             content = read_run(path)
             if PLAN_DAMAGED in content.problems:
                 raise ValueError(f"run: {path}: {PLAN_DAMAGED}: nobody knows where its points lie")
+            # points measured from now on would be of another force or band than those before
+            if changed := [of for of in content.problems if of.startswith(f"{SCENE}: ")]:
+                raise ValueError(
+                    f"run: {path}: {changed[0]}; accepted is the scene with which the run began"
+                )
             if other := _other_definitions(content):
                 raise ValueError(
                     f"run: {path} was recorded by a version with other definitions of {', '.join(other)}; "

@@ -132,6 +132,19 @@ def test_a_changed_scene_and_a_missing_file_are_named(tmp_path):
     assert found.next_point.index == 1
 
 
+@pytest.mark.parametrize("text", ["name: test\nforce_n: 0.02\n", "name: test\nforce_n: 0.015\n"])
+def test_no_scan_goes_on_with_another_scene(tmp_path, text):
+    """Points of two forces would be those of one scene."""
+    run = recorded(tmp_path / "run")
+    scene, whole = run / "scene.yaml", (run / "scene.yaml").read_text()
+    scene.write_text(text)
+    with pytest.raises(ValueError, match=r"scene.yaml: .*; accepted is the scene with which the run began"):
+        RunDirectory.open(run)
+    assert len(read_run(run).latest) == 3  # it is read all the same
+    scene.write_text(whole)
+    RunDirectory.open(run).close()
+
+
 def test_results_and_messages_from_the_index_are_those_of_the_files(tmp_path):
     run = recorded(tmp_path / "run")
     with_index = read_run(run)
