@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import html
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,13 +19,27 @@ from tactile_resonance.report.boundary import RunBoundary
 from tactile_resonance.report.page import page
 from tactile_resonance.report.page_data import HIGH, LOW, MM, listed, page_data
 from tactile_resonance.report.point_details import PointDetails
-from tactile_resonance.report.run_report import pole_maps_of, run_entry, scene_name, warnings_of
+from tactile_resonance.report.run_report import (
+    pole_maps_of,
+    run_entry,
+    scene_name,
+    scene_of,
+    warnings_of,
+)
 from tactile_resonance.scan.point_result import PointKind, PointResult
 from tactile_resonance.scan.pole_map import SAME_PLACE_M
 from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.scene import ScanScene
 
 SIGNIFICANT = 3.0
 """Standard deviations beyond which a difference is counted."""
+_CONDITIONS: dict[str, Callable[[ScanScene], str]] = {
+    "sensor": lambda scene: scene.sensor.name,
+    "band": lambda scene: f"{scene.sensor.band_low_hz:g} to {scene.sensor.band_high_hz:g} Hz",
+    "force": lambda scene: f"{1e3 * scene.force_n:g} mN",
+    "nominal contact": lambda scene: _contact_text(scene),
+}
+"""By which poles of one tissue differ, of a scene."""
 _RANGE = 6.0  # of the colours of differences, in standard deviations
 
 
@@ -64,9 +78,11 @@ class Difference:
 def differences(first: RunContent, other: RunContent) -> list[Difference]:
     """At each place of the first run within 0.1 mm of one of the other, in one frame, where both have poles.
 
-    Poles at the nominal contact are compared where both points have them: their covariance holds what force and
-    age of contact add. An error of the sensitivity to these is common to both, so it is counted twice.
+    Poles at the nominal contact are compared where both points have them and both scenes mean one force and age
+    by it: their covariance holds what force and age of contact add. An error of the sensitivity to these is
+    common to both, so it is counted twice.
     """
+    one_contact = _nominal(first) == _nominal(other)
     points, others = (
         [r for r in run.latest if not r.failed and r.kind is PointKind.TISSUE]
         for run in (first, other)
@@ -76,15 +92,38 @@ def differences(first: RunContent, other: RunContent) -> list[Difference]:
     tree = cKDTree([r.position_m for r in others])
     distance_m, nearest = tree.query([r.position_m for r in points])
     pairs = [
-        _difference(point, others[k])
+        _difference(point, others[k], one_contact)
         for point, m, k in zip(points, distance_m, nearest, strict=True)
         if m <= SAME_PLACE_M and point.frame_id == others[k].frame_id
     ]
     return [pair for pair in pairs if np.all(np.isfinite(pair.covariance))]
 
 
-def _difference(first: PointResult, other: PointResult) -> Difference:
-    nominal = all(np.isfinite(r.nominal_f0_std_hz) for r in (first, other))
+def unlike(first: RunContent, other: RunContent) -> list[str]:
+    """What sets the poles of two runs apart beside what was touched: sensor, band, force, nominal contact."""
+    scenes = scene_of(first), scene_of(other)
+    told = []
+    for what, value in _CONDITIONS.items():
+        one, two = ("unknown" if scene is None else value(scene) for scene in scenes)
+        if one != two:
+            told.append(f"{what} {two} against {one}")
+    return told
+
+
+def _contact_text(scene: ScanScene) -> str:
+    contact = scene.nominal_contact
+    return "none" if contact is None else f"{1e3 * contact.force_n:g} mN and {contact.age_s:g} s"
+
+
+def _nominal(run: RunContent) -> tuple[float, float] | None:
+    """Force [N] and age [s] to which the run's poles are referred."""
+    scene = scene_of(run)
+    contact = None if scene is None else scene.nominal_contact
+    return None if contact is None else (contact.force_n, contact.age_s)
+
+
+def _difference(first: PointResult, other: PointResult, one_contact: bool) -> Difference:
+    nominal = one_contact and all(np.isfinite(r.nominal_f0_std_hz) for r in (first, other))
     (x, p), (y, q) = (_pole(r, nominal) for r in (first, other))
     return Difference(first, other, y - x, p + q, nominal)
 
@@ -101,22 +140,32 @@ def _pole(result: PointResult, nominal: bool) -> tuple[FloatArray, FloatArray]:
     return np.array([result.nominal_f0_hz, result.nominal_damping_ratio]), np.array(covariance)
 
 
-def sentence(name: str, first: str, found: Sequence[Difference]) -> str:
-    """What the differences of one run from the first say together."""
+def sentence(name: str, first: str, found: Sequence[Difference], apart: Sequence[str] = ()) -> str:
+    """What the differences of one run from the first say together; `apart` as `unlike` gives it."""
     if not found:
         return f"{name} and {first} have no place in common (0.1 mm) where both have poles with a covariance."
     off = np.array([each.deviations for each in found])
     rms, largest = np.sqrt(np.mean(off**2, axis=0)), np.max(np.abs(off), axis=0)
     beyond = int(np.count_nonzero(np.any(np.abs(off) > SIGNIFICANT, axis=1)))
+    differ = "differs" if beyond == 1 else "differ"
     total = sum(each.distance2 for each in found)
     chance = float(stats.chi2.sf(total, 2 * len(found)))
-    which = "at the nominal contact" if all(each.nominal for each in found) else "as measured"
-    return (
-        f"{name} less {first}, {len(found)} places in common, poles {which}: differences of f0 have an rms of "
-        f"{rms[0]:.2f} of their standard deviations, at most {largest[0]:.1f}, those of the damping ratio "
-        f"{rms[1]:.2f}, at most {largest[1]:.1f}; {beyond} places differ by more than {SIGNIFICANT:g}. Were "
-        f"nothing different, chance would give as much or more with probability {chance:.2g}."
+    nominal = sum(each.nominal for each in found)
+    which = {0: "as measured", len(found): "at the nominal contact"}.get(
+        nominal, f"at the nominal contact at {nominal} of them, else as measured"
     )
+    beside = f" Beside what was touched they differ by {'; '.join(apart)}." if apart else ""
+    return (
+        f"{name} less {first}, {_places(len(found))} in common, poles {which}: differences of f0 have an rms "
+        f"of {rms[0]:.2f} of their standard deviations, at most {largest[0]:.1f}, those of the damping ratio "
+        f"{rms[1]:.2f}, at most {largest[1]:.1f}; {_places(beyond)} {differ} by more than "
+        f"{SIGNIFICANT:g}. Were "
+        f"nothing different, chance would give as much or more with probability {chance:.2g}.{beside}"
+    )
+
+
+def _places(count: int) -> str:
+    return "1 place" if count == 1 else f"{count} places"
 
 
 def as_comparison(
@@ -143,7 +192,8 @@ def as_comparison(
         for line in warnings_of(run, boundary, each)
     ]
     sentences = [
-        sentence(name, names[0], found) for name, found in zip(names[1:], pairs, strict=True)
+        sentence(name, names[0], found, unlike(runs[0], run))
+        for name, run, found in zip(names[1:], runs[1:], pairs, strict=True)
     ]
     title = f"Comparison of {', '.join(names)}"
     head = (

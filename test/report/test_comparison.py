@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from tactile_resonance.cli import main
-from tactile_resonance.report.comparison import differences, sentence
+from tactile_resonance.report.comparison import differences, sentence, unlike
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.run_content import RunContent, read_run
 
@@ -85,8 +85,34 @@ def test_poles_at_the_nominal_contact_are_compared_where_both_are_known():
     assert each.nominal
     assert each.change[0] == pytest.approx(0.3)
     assert each.deviations[0] == pytest.approx(0.3 / (0.06 * np.sqrt(2)))
-    (each,) = differences(first, drawn(1, 2))
-    assert not each.nominal
+    found = differences(first, drawn(1, 2))
+    assert not found[0].nominal
+    assert "1 place in common, poles as measured" in sentence("b", "a", found)
+    mixed = replace(drawn(2, 1), results=(*first.results, drawn(2, 1).results[1]))
+    told = sentence("b", "a", differences(mixed, mixed))
+    assert "2 places in common, poles at the nominal contact at 1 of them, else as measured" in told
+
+
+def test_what_sets_two_scenes_apart_is_named_and_no_pole_taken_as_one_of_the_others_contact(tmp_path):
+    values = {"nominal_f0_hz": 251.0, "nominal_f0_std_hz": 0.06, "nominal_damping_ratio": 0.034}
+    values |= {"nominal_damping_ratio_std": 2e-4, "nominal_f0_damping_covariance_hz": 0.0}
+    runs = []
+    for k, force_n in enumerate([0.01, 0.01, 0.02]):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        text = write_scene(folder / "scene.yaml").read_text()
+        text, count = re.subn(r"(?m)^( *force_n:) 0.01", rf"\1 {force_n}", text)
+        assert count == 2  # of the contact, and the nominal one
+        (folder / "scene.yaml").write_text(text)
+        runs.append(replace(drawn(3, k, **values), path=folder))
+    assert all(each.nominal for each in differences(*runs[:2]))
+    assert unlike(*runs[:2]) == []
+    assert not any(each.nominal for each in differences(runs[0], runs[2]))
+    apart = unlike(runs[0], runs[2])
+    assert apart[0] == "force 20 mN against 10 mN"
+    assert apart[1].startswith("nominal contact 20 mN and ")
+    told = sentence("b", "a", differences(runs[0], runs[2]), apart)
+    assert "Beside what was touched they differ by force 20 mN against 10 mN; nominal contact 20 mN" in told
 
 
 @pytest.fixture(scope="module")
