@@ -23,7 +23,6 @@ from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.front import read_record
 from tactile_resonance.poles.order_choice import CANDIDATES
-from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.silent import silent_record
@@ -32,6 +31,7 @@ MOST_HARMONICS = 10**7
 
 OPTIONS = {
     "measurement_id": "--measurement",
+    "point": "--point",
     "u": "--u",
     "y": "--y",
     "sample_rate_hz": "--sample-rate",
@@ -64,6 +64,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         "--measurement", type=int, metavar="ID", help="which one of a folder with several"
+    )
+    parser.add_argument(
+        "--point", type=int, metavar="N", help="of a run in place of --measurement: its point N, from 1"
     )
     parser.add_argument("--u", metavar="FIELD", help="actuator field (default: u)")
     parser.add_argument("--y", metavar="FIELD", help="sensor field (default: y)")
@@ -228,6 +231,12 @@ def run(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     """Nothing is written unless all went well."""
     _check_outputs(options)
+    if options.point is not None:
+        if options.measurement is not None:
+            raise ValueError("point: given beside --measurement, expected one of them")
+        from tactile_resonance.scan.recorded import measurement_at
+
+        options.measurement = measurement_at(options.record, options.point)
     if options.calibration is not None:
         return analyze_contacts(options, lambda key: _recording(options, key), as_text)
     recording = _recording(options)
@@ -313,13 +322,12 @@ def as_text(analysis: Analysis) -> str:
         f0_std, damping_std = np.sqrt(np.diag(poles.best_covariance[k]))
         lines.append(
             f"mode: f0 {poles.f0_hz[k]:.4f} +- {f0_std:.2g} Hz, damping ratio "
-            f"{poles.damping_ratio[k]:.6f} +- {damping_std:.2g}, pole {pole.real:.3f} "
-            f"+- j{pole.imag:.3f} rad/s"
+            f"{poles.damping_ratio[k]:.6f} +- {damping_std:.2g}, poles at "
+            f"{pole.real:.3f} + {pole.imag:.3f}j rad/s and its conjugate"
         )
     if analysis.distortion is not None:
         lines.append(f"distortion: {analysis.distortion.summary()}")
-    if poles.status is not PolesStatus.OK:
-        lines.append(f"status: {poles.status.value}")
+    lines.append(f"status: {poles.status.value}")
     lines += [f"note: {warning}" for warning in analysis.warnings]
     return "\n".join(lines)
 

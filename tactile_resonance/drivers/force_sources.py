@@ -47,10 +47,12 @@ def force_source(
         except ImportError as error:
             raise ValueError("kind: can needs python-can: pip install python-can") from error
         cell = CanWrench(config, clock)
-    elif not isinstance(config, TopicForce):
-        cell = RtdeWrench(config, arm_state, clock, arm_clock_std_s)
-    elif topic is None:
-        raise ValueError("kind: topic is for nodes only")
-    else:
+    elif isinstance(config, TopicForce):
+        if topic is None:
+            raise ValueError("kind: topic is for nodes only")
         cell = topic(config)
+    elif type(config) is ForceConfig:
+        cell = RtdeWrench(config, arm_state, clock, arm_clock_std_s)
+    else:
+        raise TypeError(f"no source of force for {type(config).__name__}")
     return TipForce(cell, config.mounting, arm_state, config.inertia_window_s)

@@ -167,11 +167,12 @@ class StoredMeasurement:
 
 @dataclass(frozen=True)
 class StoredEntry:
-    """One measurement of a store or a run: its id, folder or file, and the function that reads it."""
+    """One measurement of a store or a run: id, folder or file, the function that reads it, and its place."""
 
     measurement_id: int
     path: Path
     reader: Callable[[StoredEntry], StoredMeasurement]
+    place: str = ""
 
     def read(self) -> StoredMeasurement:
         """Everything readable of it; ValueError where nothing is, OSError where it cannot be listed."""
@@ -181,7 +182,8 @@ class StoredEntry:
 def choose(entries: Sequence[StoredEntry], measurement_id: int | None, where: Path) -> StoredEntry:
     """The entry of an id, or the only one where none is named; ValueError that lists what is there."""
     by_id = {entry.measurement_id: entry for entry in entries}
-    ids = ", ".join(str(key) for key in list(by_id)[:_MOST_LISTED]) or "none"
+    named = [f"{key} ({entry.place})" if entry.place else f"{key}" for key, entry in by_id.items()]
+    ids = ", ".join(named[:_MOST_LISTED]) or "none"
     if len(by_id) > _MOST_LISTED:
         ids += f" and {len(by_id) - _MOST_LISTED} more"
     if measurement_id is None and len(entries) == 1:

@@ -20,6 +20,7 @@ from tactile_resonance.report.page import page
 from tactile_resonance.report.page_data import HIGH, LOW, MM, listed, page_data
 from tactile_resonance.report.point_details import PointDetails
 from tactile_resonance.report.run_report import (
+    median_std,
     pole_maps_of,
     run_entry,
     scene_name,
@@ -227,7 +228,7 @@ def _runs_table(runs: Sequence[RunContent], names: Sequence[str]) -> str:
         "points",
         "with poles",
         "f0 [Hz]",
-        "std of f0 [Hz]",
+        "std of f0",
         "tissue",
     )
     rows = []
@@ -235,7 +236,7 @@ def _runs_table(runs: Sequence[RunContent], names: Sequence[str]) -> str:
         found = [r for r in run.latest if not r.failed]
         f0 = np.array([r.f0_hz for r in found])
         spread = f"{f0.min():.2f} to {f0.max():.2f}" if found else "-"
-        std = f"{np.median([r.f0_std_hz for r in found]):.2g}" if found else "-"
+        std = median_std(found) if found else "-"
         classes = Counter(r.tissue_class for r in found if r.tissue_class)
         called = ", ".join(f"{tissue} {count}" for tissue, count in classes.most_common())
         counts = f"{len(run.latest)} of {len(run.points)}", f"{len(found)}"

@@ -14,9 +14,15 @@ from tactile_resonance.scan.point_result import PointOutcome, PointResult
 _HEAD = "point  x [mm]  y [mm]  force [mN]  f0 [Hz]   +- std   damping   +- std   tissue                  "
 _TRUTH_HEAD = "true f0   dev  true damping   dev"
 
+SURE = ("", "ok", "no covariance")
+"""Status of poles that nothing speaks against."""
+
 
 def point_table(results: Sequence[PointResult], truths: Mapping[int, PointTruth]) -> str:
-    """One line per point; deviations from the truth in standard deviations of the point."""
+    """One line per point, with the status of its poles where something speaks against them.
+
+    Deviations from the truth are in standard deviations of the point.
+    """
     head = _HEAD + (_TRUTH_HEAD if truths else "")
     lines = [head.rstrip(), "-" * len(head.rstrip())]
     for result in results:
@@ -32,6 +38,8 @@ def point_table(results: Sequence[PointResult], truths: Mapping[int, PointTruth]
         if truth is not None:
             off = deviation(result, truth)
             line += f"  {truth.estimate[0]:7.3f}  {off[0]:+4.1f}       {truth.estimate[1]:.5f}  {off[1]:+4.1f}"
+        if result.poles_status not in SURE:
+            line += f"  {result.poles_status}"
         lines.append(line.rstrip())
     return "\n".join(lines)
 

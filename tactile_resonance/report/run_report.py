@@ -19,7 +19,7 @@ from tactile_resonance.report.page import page
 from tactile_resonance.report.page_data import map_entry, page_data, point_entry
 from tactile_resonance.report.paper_figures import paper_figures
 from tactile_resonance.report.point_details import PointDetails, lines_each
-from tactile_resonance.report.point_table import repeats_sentence, table_notes
+from tactile_resonance.report.point_table import SURE, repeats_sentence, table_notes
 from tactile_resonance.report.run_tables import Truths
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.point_times import budget_sentence
@@ -41,7 +41,6 @@ _SHOWN = {"skipped", "notes", "surface"}
 _FIGURES = "Figures in the manner of the paper, from the estimates of the run"
 _CELLS = 60  # of the map between the points, along its longer side
 _MOST_NAMED = 8  # points or files, in a warning
-_SURE = ("ok", "no covariance")  # status of poles that nothing speaks against
 _SIGNIFICANT, _FORCE_SHARE = 4.0, 0.05
 
 
@@ -193,7 +192,7 @@ def warnings_of(
         ("failed", [r for r in results if r.outcome is PointOutcome.FAILED], lambda r: r.reason),
         (
             "poles with a remark",
-            [r for r in measured if r.poles_status not in ("", *_SURE)],
+            [r for r in measured if r.poles_status not in SURE],
             lambda r: r.poles_status,
         ),
         ("force other than the scene's", off, lambda r: f"{1e3 * r.force_n:.2f} mN"),
@@ -261,9 +260,8 @@ def summary(run: RunContent) -> list[str]:
     found = [r for r in run.latest if np.isfinite(r.f0_hz)]
     if found:
         f0 = np.array([r.f0_hz for r in found])
-        std = np.median([r.f0_std_hz for r in found])
         lines.append(
-            f"f0 from {f0.min():.2f} to {f0.max():.2f} Hz, standard deviation of a point {std:.2g} Hz (median)."
+            f"f0 from {f0.min():.2f} to {f0.max():.2f} Hz, standard deviation of a point {median_std(found)}."
         )
     blocks = sum(r.blocks for r in run.latest)
     saved = sum(r.blocks_saved for r in run.latest)
@@ -280,6 +278,16 @@ def summary(run: RunContent) -> list[str]:
         lines.append(f"Tissue called: {named}.")
         lines.append(_compared(run, [r for r in run.latest if r.tissue_class]))
     return lines
+
+
+def median_std(results: Sequence[PointResult]) -> str:
+    """Median of the standard deviations of f0, and of how many points there is none."""
+    known = [r.f0_std_hz for r in results if np.isfinite(r.f0_std_hz)]
+    if not known:
+        return "unknown"
+    without = len(results) - len(known)
+    unknown = f", unknown at {without} of {len(results)} points" if without else ""
+    return f"{np.median(known):.2g} Hz (median{unknown})"
 
 
 def read_silent(run: RunContent) -> SilentRecord | None:

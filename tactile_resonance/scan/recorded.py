@@ -21,7 +21,7 @@ from tactile_resonance.scan.point_result import (
     from_message,
     serialised,
 )
-from tactile_resonance.scan.run_content import RECORDING, RunContent, file_of, read_run
+from tactile_resonance.scan.run_content import POINT_FILE, RECORDING, RunContent, file_of, read_run
 from tactile_resonance.scan.run_index import read_entries
 
 EXCITATION = "tactile_resonance/msg/Excitation"
@@ -68,8 +68,32 @@ def run_entries(run: Path) -> list[StoredEntry]:
 
 def _entries(run: RunContent) -> list[StoredEntry]:
     return [
-        StoredEntry(key, path, _read) for path in run.paths_in_order for key in _ids_of(path)
+        StoredEntry(key, path, _read, _place_of(path))
+        for path in run.paths_in_order
+        for key in _ids_of(path)
     ]
+
+
+def _place_of(path: Path) -> str:
+    """Where a file was recorded, for people, who count points from 1."""
+    match = POINT_FILE.fullmatch(path.name)
+    return path.stem if match is None else f"point {int(match[1]) + 1}"
+
+
+def measurement_at(run: Path, point: int) -> int:
+    """Id of the newest measurement at a point, counted from 1.
+
+    Raises
+    ------
+    ValueError
+        If it is no run, or the point is not of it or has no measurement.
+    """
+    content = read_run(run)
+    measured = {r.index + 1: r.measurement_id for r in content.latest if r.measurement_id}
+    if point not in measured:
+        known = ", ".join(map(str, sorted(measured))) or "none"
+        raise ValueError(f"point: {point}, measured points of {run} are {known}")
+    return measured[point]
 
 
 def _read(entry: StoredEntry) -> StoredMeasurement:

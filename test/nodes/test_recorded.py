@@ -160,7 +160,23 @@ def test_analyze_reads_a_run(run, tmp_path, capsys):
     assert main(["analyze", str(run)]) == 1
     assert "not given" in capsys.readouterr().err
     assert main(["analyze", str(run), "--measurement", "5"]) == 1
-    assert "holds 13, 11, 12" in capsys.readouterr().err
+    known = "holds 13 (reference-00-air-before), 11 (point 1), 12 (point 2)"
+    assert known in capsys.readouterr().err
+
+
+def test_analyze_takes_a_point_of_a_run(run, tmp_path, capsys):
+    output = tmp_path / "out.json"
+    arguments = ["analyze", str(run), "--band", "200", "300", "--json", str(output)]
+    found = []
+    for which in (["--measurement", "12"], ["--point", "2"]):
+        assert main([*arguments, *which]) == 0
+        assert "\nstatus: ok\n" in capsys.readouterr().out
+        found.append(json.loads(output.read_text())["poles"])
+    assert found[0] == found[1]
+    assert main([*arguments, "--point", "3"]) == 1
+    assert f"point (--point): 3, measured points of {run} are 1, 2" in capsys.readouterr().err
+    assert main([*arguments, "--point", "2", "--measurement", "12"]) == 1
+    assert "beside --measurement" in capsys.readouterr().err
 
 
 def test_numbers_of_the_core_are_the_constants_of_the_messages():

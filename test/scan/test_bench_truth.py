@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The truth of a point is that of the blocks its poles rest on, and the table says how far off they are."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -79,4 +80,7 @@ def test_the_table_tells_truth_failures_and_repeats(run):
     assert "rms 3.00 of f0, 1.00 of the damping ratio; largest 3.0" in deviation
     assert repeats == "1 of 3 points had to be repeated, 3 times in all: force_stale 2, arm_stale 1"
     assert "true f0" not in point_table(run.latest, {})
+    assert "ok" not in lines[2]
+    doubted = [dataclasses.replace(run.latest[0], poles_status="model error")]
+    assert point_table(doubted, {}).endswith("  model error")
     assert repeats_sentence(run.latest[1:]) == "no point had to be repeated"

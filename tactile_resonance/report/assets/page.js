@@ -117,6 +117,8 @@
     const title = [page.runs.length > 1 ? plain(run.name) : "map of f0", run.bands.length > 1 ? shown.name : ""].filter(Boolean).join(", ");
     const square = { scaleanchor: "x", scaleratio: 1 };
     return draw(place, traces, { title: title + (run.simulated ? " (simulated, not measured)" : ""),
+      // below: with a boundary it has more entries than fit between the title and the buttons
+      legend: { orientation: "h", x: 0, yref: "container", y: 0.005, yanchor: "bottom", font: { size: 11 } },
       xaxis: axis("x [mm]", { constrain: "domain" }), yaxis: axis("y [mm]", square) });
   }
 
