@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import asdict, dataclass, fields, replace
 from enum import Enum, IntEnum
 from typing import Any
@@ -216,7 +217,7 @@ def serialised(result: PointResult, poles: Any = None) -> bytes:
 
 def from_message(message: Any) -> PointResult:
     """Result of a message, of rosbags or of ROS."""
-    content = {name: getattr(message, name) for name in COLUMNS if name not in _HEADER}
+    content = {name: _shared(getattr(message, name)) for name in COLUMNS if name not in _HEADER}
     content["outcome"] = PointOutcome(message.outcome)
     content["kind"] = PointKind(message.kind or PointKind.TISSUE)
     poles = poles_from_message(message.poles[0])[0] if len(message.poles) else Poles()
@@ -227,6 +228,13 @@ def from_message(message: Any) -> PointResult:
         distortion=distortion_from_message(message),
         further=band_results(poles),
     )
+
+
+def _shared(value: Any) -> Any:
+    """One object for all equal texts and for all NaN: a run keeps ten thousand results."""
+    if isinstance(value, str):
+        return sys.intern(value)
+    return NAN if value != value else value
 
 
 def mode_columns(estimate: FloatArray, covariance: FloatArray, prefix: str = "") -> dict[str, Any]:
