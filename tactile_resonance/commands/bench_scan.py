@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.calibration.file import read_calibration
+from tactile_resonance.counted import counted
 from tactile_resonance.processes import (
     ENDING,
     NodeProcesses,
@@ -330,7 +331,7 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
         raise ValueError(f"scan: {result.message}")
     print(
         f"{result.message}: {result.done} points with poles, {result.failed} failed, {result.skipped} "
-        f"skipped; {result.blocks} blocks, {result.blocks_saved} not needed ({result.saved_s:.1f} s)"
+        f"skipped; {counted(result.blocks, 'block')}, {result.blocks_saved} not needed ({result.saved_s:.1f} s)"
     )
     if stalls:
         print(f"the simulation itself stood still for more than 10 ms: {stalls} times")

@@ -8,6 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.counted import counted
 from tactile_resonance.files import csv_text, write_whole
 
 if TYPE_CHECKING:
@@ -118,12 +119,12 @@ def run(options: argparse.Namespace) -> int:
     )
     if pairs is not None:
         print(f"{int(pairs.sum()) // 2} of {len(x) * (len(x) - 1) // 2} pairs differ")
-    print(f"{len(groups.mean)} groups, by the Bayesian information criterion:")
+    print(f"{counted(len(groups.mean), 'group')}, by the Bayesian information criterion:")
     for k, (mean, covariance) in enumerate(zip(groups.mean, groups.covariance, strict=True)):
         own = np.sqrt(np.diag(covariance))
         print(
-            f"  {k + 1}: {int(np.sum(groups.of_point == k))} points, f0 {mean[0]:.3f} +- {own[0]:.2g} Hz, "
-            f"damping ratio {mean[1]:.5f} +- {own[1]:.2g}"
+            f"  {k + 1}: {counted(int(np.sum(groups.of_point == k)), 'point')}, "
+            f"f0 {mean[0]:.3f} +- {own[0]:.2g} Hz, damping ratio {mean[1]:.5f} +- {own[1]:.2g}"
         )
     table: list[list[object]] = [[*COLUMNS]]
     for k, (name, result) in enumerate(kept):

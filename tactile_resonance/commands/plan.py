@@ -7,6 +7,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.counted import counted
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -78,7 +80,7 @@ def _expected(path: Path, plan: Plan) -> list[str]:
             else f"no pole from {of.band_hz[0]:g} to {of.band_hz[1]:g} Hz: {of.status.value}"
             for of in poles.bands
         )
-        lines.append(f"on {tissue.name} (simulated) after {count} blocks: {found}")
+        lines.append(f"on {tissue.name} (simulated) after {counted(count, 'block')}: {found}")
     if blocks:
         mean = round(sum(blocks) / len(blocks))
         lines.append(f"time {plan.duration_s(mean):.0f} s")
@@ -124,9 +126,9 @@ def _draw(plan: Plan) -> Figure:
     figure.suptitle(f"plan of {plan.scene.name}")
     above, lines = figure.subplots(1, 2)
     x_mm, y_mm = ([1e3 * point.position_m[k] for point in plan.first_points] for k in range(2))
-    title = f"{len(plan.points)} points"
+    title = counted(len(plan.points), "point")
     if plan.scene.adaptive is not None:
-        title = f"{len(x_mm)} points first, then at most {plan.most_points - len(x_mm)} of the dots"
+        title = f"{counted(len(x_mm), 'point')} first, then at most {plan.most_points - len(x_mm)} of the dots"
         places_mm = ([1e3 * point.position_m[k] for point in plan.points] for k in range(2))
         above.plot(*places_mm, ".", color="0.8", ms=2)
     above.plot(x_mm, y_mm, "-", color="0.7", lw=0.8)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.counted import counted
 from tactile_resonance.files import write_whole
 
 if TYPE_CHECKING:
@@ -261,7 +262,7 @@ def _labels(given: str, runs: Sequence[RunContent]) -> LabelOf:
 def print_left_out(reasons: Counter[str]) -> None:
     """How many points, and why."""
     for reason, count in reasons.most_common():
-        print(f"left out: {count} points, {reason}")
+        print(f"left out: {counted(count, 'point')}, {reason}")
 
 
 def _spread_lines(spread: TissueSpread) -> list[str]:
@@ -273,7 +274,7 @@ def _spread_lines(spread: TissueSpread) -> list[str]:
         return f"{f0_hz:8.4f} Hz  {damping:9.2e}"
 
     lines = [
-        f"{spread.name}: {spread.points} points, f0 {spread.mean[0]:.3f} Hz, damping ratio "
+        f"{spread.name}: {counted(spread.points, 'point')}, f0 {spread.mean[0]:.3f} Hz, damping ratio "
         f"{spread.mean[1]:.5f}",
         f"  {'noise':<12} {std(spread.noise)}  of a measurement",
         f"  {'force, age':<12} {std(spread.force)}  what they add to it",

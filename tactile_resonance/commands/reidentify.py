@@ -10,6 +10,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from tactile_resonance.counted import counted
 from tactile_resonance.poles.structure import ModelStructure
 
 
@@ -79,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     begun_s = time.monotonic()
     with _Progress() as bar:
         counts, left_out = reidentify(options.runs, csv, npz, band_hz, structure, bar.show)
-    print(f"{counts.total()} points in {time.monotonic() - begun_s:.1f} s: {csv}, {npz}")
+    print(f"{counted(counts.total(), 'point')} in {time.monotonic() - begun_s:.1f} s: {csv}, {npz}")
     for status, count in counts.most_common():
         print(f"{status}: {count}")
     for text in left_out:

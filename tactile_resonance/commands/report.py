@@ -87,7 +87,7 @@ def report_run(folder: Path) -> int:
         summary,
     )
     from tactile_resonance.scan.plan_text import map_names
-    from tactile_resonance.scan.run_content import NOT_CHECKED
+    from tactile_resonance.scan.run_content import not_checked
 
     details, boundary = details_of(content), boundary_of_run(content)
     truths = truths_with(content, details)
@@ -113,7 +113,7 @@ def report_run(folder: Path) -> int:
     for problem in content.problems:
         print(f"damaged: {problem}")
     if content.unchecked:
-        print(NOT_CHECKED.format(content.unchecked))
+        print(not_checked(content.unchecked))
     drawn = ["report.html", *map_names(len(pole_maps))]
     drawn += [] if boundary is None else [FILE]
     if pole_maps:

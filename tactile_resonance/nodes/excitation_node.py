@@ -12,6 +12,7 @@ from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
+from tactile_resonance.counted import counted
 from tactile_resonance.drivers.acquisition import (
     AcquiredBlock,
     AcquisitionDevice,
@@ -146,7 +147,7 @@ class ExcitationNode(ManagedNode):
             result.outcome = Measure.Result.DONE
         except Cancelled:
             result.outcome = Measure.Result.CANCELLED
-            result.message = f"cancelled after {result.blocks} blocks"
+            result.message = f"cancelled after {counted(result.blocks, 'block')}"
         except (ValueError, OSError, DeviceError) as error:
             if isinstance(error, NotReady):
                 result.outcome = Measure.Result.NOT_READY

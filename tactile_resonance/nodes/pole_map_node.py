@@ -14,6 +14,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from tactile_resonance import msg
+from tactile_resonance.counted import counted
 from tactile_resonance.fields import build, numbers
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
@@ -250,7 +251,7 @@ class PoleMapNode(ManagedNode):
         return point
 
     def _on_clear(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.message = f"{len(self._grown)} points cleared"
+        response.message = f"{counted(len(self._grown), 'point')} cleared"
         response.success = True
         self._grown = GrowingMap()
         self._renew()

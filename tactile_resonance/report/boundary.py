@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+from tactile_resonance.counted import counted
 from tactile_resonance.report.run_report import scene_of
 from tactile_resonance.scan.adaptive import Adaptive, known_points
 from tactile_resonance.scan.level_set import Boundary, Lines, difference_m2
@@ -73,7 +74,8 @@ class RunBoundary:
         found = self.boundary
         levels = " and ".join(f"{level:.2f}" for level in found.level_set.levels)
         lines = [
-            f"Boundary at {levels} Hz after {self.touches} touches: {1e6 * found.area_m2:.1f} mm2 within, "
+            f"Boundary at {levels} Hz after {counted(self.touches, 'touch', 'touches')}: "
+            f"{1e6 * found.area_m2:.1f} mm2 within, "
             f"{1e6 * found.wrong_area_m2:.2g} mm2 expected on its wrong side, "
             f"{1e6 * self.wanted_m2:.3g} mm2 asked for{'' if self.met else ': not met'}."
         ]

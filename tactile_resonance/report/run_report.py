@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from tactile_resonance.counted import counted
 from tactile_resonance.report import run_tables as tables
 from tactile_resonance.report.drawing import SIMULATED
 from tactile_resonance.report.page import page
@@ -27,7 +28,7 @@ from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
 from tactile_resonance.scan.protocols import TYPE as TEST_TYPE
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
-from tactile_resonance.scan.run_content import NOT_CHECKED, RECORDING, RunContent
+from tactile_resonance.scan.run_content import RECORDING, RunContent, not_checked
 from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
 from tactile_resonance.silent import SilentRecord, silent_record
 from tactile_resonance.strict_yaml import parse_yaml
@@ -166,13 +167,14 @@ def warnings_of(
     scene, results = scene_of(run), run.latest
     told = [f"damaged: {problem}" for problem in run.problems[:_MOST_NAMED]]
     if len(run.problems) > _MOST_NAMED:
-        told.append(f"{len(run.problems) - _MOST_NAMED} further files are damaged")
+        more = counted(len(run.problems) - _MOST_NAMED, "further file is", "further files are")
+        told.append(f"{more} damaged")
     if run.unchecked:
-        told.append(NOT_CHECKED.format(run.unchecked))
+        told.append(not_checked(run.unchecked))
     unread = [each.problem for each in (details or {}).values() if each.problem]
     if unread:
         told.append(
-            f"FRF, force or mechanical tests of {len(unread)} points cannot be read: {unread[0]}"
+            f"FRF, force or mechanical tests of {counted(len(unread), 'point')} cannot be read: {unread[0]}"
         )
     if scene is None:
         told.append("scene.yaml cannot be read: plan and outcome cannot be compared")
@@ -268,7 +270,8 @@ def summary(run: RunContent) -> list[str]:
     if saved:
         seconds = float(np.nansum([r.saved_s for r in run.latest]))
         lines.append(
-            f"{blocks} blocks measured; {saved} more were allowed and not needed, {seconds:.1f} s saved."
+            f"{counted(blocks, 'block')} measured; {saved} more were allowed and not needed, "
+            f"{seconds:.1f} s saved."
         )
     if time := budget_sentence(run.latest):
         lines.append(time)

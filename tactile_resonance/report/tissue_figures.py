@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.counted import counted
 from tactile_resonance.report.drawing import SIMULATED, draw_ellipse, new_figure
 from tactile_resonance.tissue.clusters import Clusters
 from tactile_resonance.tissue.differences import Differences
@@ -142,7 +143,7 @@ def draw_comparison(
     of_point, differs = groups.of_point, found.differs
     for k in range(len(groups.mean)):
         own = of_point == k
-        label = f"group {k + 1}: {int(own.sum())} points"
+        label = f"group {k + 1}: {counted(int(own.sum()), 'point')}"
         places.plot(*(1e3 * position_m[own].T), "o", color=f"C{k}", ms=5, label=label)
         poles.plot(*estimates[own].T, ".", color=f"C{k}")
         draw_ellipse(

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.counted import counted
 from tactile_resonance.fields import check_above_zero, require
 from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
@@ -145,7 +146,7 @@ def decide(
     elif wanted is None:
         reason = "no precision requested"
     if verdict is Verdict.CONTINUE and blocks >= limits.most:
-        verdict, reason = Verdict.MOST_BLOCKS, f"{blocks} blocks; {reason}"
+        verdict, reason = Verdict.MOST_BLOCKS, f"{counted(blocks, 'block')}; {reason}"
     saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
     return Decision(verdict, reason, blocks, saved, saved * block_s, called)
 
@@ -297,7 +298,7 @@ def _precise(
         staying = covariance[k, k] - falling
         last = math.sqrt(staying + falling * blocks / limits.most)
         if last > HOPELESS_FACTOR * asked:
-            hopeless.append(f"{text}, {last:.2g} expected after {limits.most} blocks")
+            hopeless.append(f"{text}, {last:.2g} expected after {counted(limits.most, 'block')}")
     if not missing:
         return Verdict.PRECISE, "standard deviations as asked for"
     if hopeless and blocks < limits.most:

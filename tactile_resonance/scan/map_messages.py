@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.counted import counted
 from tactile_resonance.recording.messages import POLES_STATUS, write_header
 from tactile_resonance.scan.level_set import LevelSet
 from tactile_resonance.scan.messages import make_message, message_types
@@ -177,7 +178,7 @@ def legend_lines(
         f"ellipses: {100 * probability:g} %",
         f"x: 1 mm = {1e-3 / scale.m_per_hz:.2g} Hz of f0",
         f"y: 1 mm = {1e-3 / scale.m_per_damping:.2g} of damping ratio",
-        f"{len(pole_map.estimated)} points, {len(pole_map.failures)} failed",
+        f"{counted(len(pole_map.estimated), 'point')}, {len(pole_map.failures)} failed",
     ]
     for name in pole_map.classes():
         number = names.index(name) if name in names else NO_CLASS

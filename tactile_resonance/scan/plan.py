@@ -12,6 +12,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.counted import counted
 from tactile_resonance.scan.adaptive import known_points
 from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
@@ -56,7 +57,7 @@ class Plan:
         each = [replace(left, saved_s=left.saved_s * count) for left in self.measurement.skipped]
         if near := self.near:
             what = (
-                f"rest for the tare, and height that the surface does not ask for, at {near} points"
+                f"rest for the tare, and height that the surface does not ask for, at {counted(near, 'point')}"
             )
             why = "zero and plane are known from the point before"
             each.append(Skipped(what, why, near * (CONTACT_S - NEAR_CONTACT_S)))
@@ -219,7 +220,7 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
     plan = plan_points(scene, points)
     each_s = CONTACT_S + plan.measurement.blocks.most * plan.measurement.block_s
     left_out = tuple(
-        Skipped(f"{int(left.sum())} points", why, float(left.sum() * each_s))
+        Skipped(counted(int(left.sum()), "point"), why, float(left.sum() * each_s))
         for left, why in (
             (off, "beside the surface"),
             (steep, f"steeper than {np.degrees(STEEPEST_RAD):.0f} degrees"),

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tactile_resonance.contact.force_spread import SHORTEST_S
+from tactile_resonance.counted import counted
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.decision import Precise, Separate
 from tactile_resonance.scan.measurement import CALIBRATED_S, MeasurementDesign, design_measurement
@@ -38,7 +39,7 @@ def plan_rows(plan: Plan) -> Rows:
     rows = [
         (
             "touches",
-            f"{at_most}{in_all}: {count} points"
+            f"{at_most}{in_all}: {counted(count, 'point')}"
             + (f", {before} for surface and normals" if before else ""),
         ),
     ]
@@ -46,8 +47,9 @@ def plan_rows(plan: Plan) -> Rows:
         rows += [
             (
                 "adaptive",
-                f"{len(plan.first_points)} points first, each of the others where it is expected to show "
-                f"most of what is {1e3 * scene.adaptive.smallest_m:g} mm wide or wider, among "
+                f"{counted(len(plan.first_points), 'point')} first, "
+                "each of the others where it is expected to show most of what is "
+                f"{1e3 * scene.adaptive.smallest_m:g} mm wide or wider, among "
                 f"{len(plan.points)} places",
             ),
             ("chosen until", f"{adaptive_wanted(scene.adaptive)}, or the most points"),
@@ -111,8 +113,8 @@ def _found(asked: Adaptive, results: Sequence[PointResult]) -> str:
     met = "enough" if loss <= asked.wanted.most_loss else "not enough"
     if isinstance(asked.wanted, WantedMap):
         _, std_hz = surface.predict(asked.raster.xy_m[asked.raster.within])
-        return f"{met}: +- {std_hz.max():.2g} Hz at most, {len(results)} touches"
-    return f"{met}: {1e6 * loss:.2g} mm2, {len(results)} touches"
+        return f"{met}: +- {std_hz.max():.2g} Hz at most, {counted(len(results), 'touch', 'touches')}"
+    return f"{met}: {1e6 * loss:.2g} mm2, {counted(len(results), 'touch', 'touches')}"
 
 
 def _period(plan: Plan) -> str:

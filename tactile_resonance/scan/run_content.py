@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
+from tactile_resonance.counted import counted
 from tactile_resonance.fields import read_dataclass
 from tactile_resonance.scan.mcap_checksums import is_checked
 from tactile_resonance.scan.point_file import FileContent, read_content, read_messages
@@ -21,7 +22,6 @@ from tactile_resonance.scan.point_result import TOPIC, PointResult, from_message
 from tactile_resonance.scan.run_index import Entry, damaged_lines, read_entries
 from tactile_resonance.scan.scan_point import ScanPoint
 
-NOT_CHECKED = "{} files are not checked for damage: an earlier version recorded them"
 FORMAT = "tactile_resonance run 1"
 RECORDING, SCENE = "recording", "scene.yaml"
 POINT_FILE = re.compile(r"point-(\d{5})-(\d{2,})\.mcap")
@@ -89,6 +89,12 @@ class RunContent:
             counts[file.name] += sum(t.count for t in file.topics if t.type_name == type_name)
         names = {result.index: file_of(self.path, result).name for result in self.latest}
         return {index: counts[name] for index, name in names.items() if counts[name]}
+
+
+def not_checked(files: int) -> str:
+    """A sentence on files without a checksum."""
+    which = counted(files, "file is", "files are")
+    return f"{which} not checked for damage: an earlier version recorded what has no checksum"
 
 
 def file_of(run: Path, result: PointResult) -> Path:

@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.interfaces import Qos
 
+from tactile_resonance.counted import counted
 from tactile_resonance.files import write_whole
 from tactile_resonance.recording.stored_file import sync_folder
 from tactile_resonance.scan.measurement import MeasurementDesign
@@ -386,7 +387,7 @@ def expected_bytes(points: int, design: MeasurementDesign) -> int:
 
 def ended_by_storage(path: Path, error: OSError, safe: int) -> str:
     """Why a run ends that cannot be written, and how many of its points are safe."""
-    points = "1 point is" if safe == 1 else f"{safe} points are"
+    points = counted(safe, "point is", "points are")
     return f"{path}: {error.strerror or error}; {points} safe in it, resume goes on"
 
 

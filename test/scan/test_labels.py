@@ -132,7 +132,7 @@ def test_a_library_is_checked_on_another_run(runs, tmp_path, capsys):
     figure = tmp_path / "check.svg"
     check = ["references", "check", runs[5], "--library", library, "--labels", labels]
     printed = called([*check, "--figure", figure], capsys)
-    assert "left out: 1 points, no label" in printed
+    assert "left out: 1 point, no label" in printed
     assert "called right: 7 of 7" in printed
     assert figure.read_text().startswith("<?xml")
     labels.write_text("tissue\nliver\n")

@@ -134,7 +134,7 @@ def test_points_beside_or_too_steep_are_skipped_and_say_what_that_saves():
     asked = scene([[-0.015, 0], [0.03, 0], [0.015, 0], [-0.01, 0]], surface=surface)
     plan = make_plan(asked)
     assert len(plan.points) == 2
-    left = {s.why: s for s in plan.skipped if "points" in s.what}
+    left = {s.why: s for s in plan.skipped if "point" in s.what}
     assert set(left) == {"beside the surface", "steeper than 60 degrees"}
     one_s = replace(plan, points=plan.points[:1]).longest_s
     assert left["beside the surface"].saved_s == pytest.approx(one_s)
