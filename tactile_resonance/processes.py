@@ -25,6 +25,7 @@ ENDING = tuple(
 )
 """Signals that ask a process to end: Ctrl-C, kill, and a terminal that is closed."""
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_TAKEN: dict[int, socket.socket] = {}  # ROS domains that this process took, until it ends
 
 
 class NodeProcesses:
@@ -133,10 +134,10 @@ class NodeProcesses:
 
 
 def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
-    """ROS_DOMAIN_ID where it is set, else one in which no participant is left, also none that is just ending.
+    """ROS_DOMAIN_ID where it is set, else one without participants, taken for this process until it ends.
 
-    Ports follow the DDS interoperability wire protocol (OMG DDSI-RTPS 2.2, section 9.6.1.1): unicast
-    discovery of participant n listens on 7400 + 250 domain + 10 + 2 n.
+    Nodes take seconds to come up: of two processes that look at a free domain meanwhile, one takes it.
+    Not free is also a domain whose last participant is just ending.
     """
     given = environment.get("ROS_DOMAIN_ID", "")
     if given:
@@ -146,13 +147,36 @@ def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:
     first = os.getpid() % 100
     for step in range(100):
         domain = 1 + (first + step) % 100  # 1..100: portable, below the ephemeral ports
-        if domain_is_free(domain):
+        if not domain_is_free(domain):
+            continue
+        if domain in _TAKEN:
+            return domain
+        if taken := hold_domain(domain):
+            _TAKEN[domain] = taken
             return domain
     raise RuntimeError("ROS_DOMAIN_ID: none of 1..100 is free on this machine, set one")
 
 
+def hold_domain(domain: int) -> socket.socket | None:
+    """What keeps a ROS domain from `free_domain_id` of others until it is closed; None where one is taken.
+
+    It is the TCP port of the domain's first UDP port, to which no participant listens.
+    """
+    taken = socket.socket()
+    try:
+        taken.bind(("127.0.0.1", 7400 + 250 * domain))
+    except OSError:
+        taken.close()
+        return None
+    return taken
+
+
 def domain_is_free(domain: int) -> bool:
-    """Whether no participant of a ROS domain is on this machine."""
+    """Whether no participant of a ROS domain is on this machine.
+
+    Ports follow the DDS interoperability wire protocol (OMG DDSI-RTPS 2.2, section 9.6.1.1): unicast
+    discovery of participant n listens on 7400 + 250 domain + 10 + 2 n.
+    """
     ports = range(7410 + 250 * domain, min(7400 + 250 * (domain + 1), 65536), 2)
     return all(map(_port_is_free, ports))
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which domain nodes are started in."""
 
+import os
 import socket
 
 import pytest
 
-from tactile_resonance.processes import free_domain_id
+from tactile_resonance.processes import free_domain_id, hold_domain
 
 
 @pytest.mark.parametrize("participant", [0, 3, 119])
@@ -16,6 +17,16 @@ def test_a_domain_with_a_participant_left_is_not_chosen(participant):
         left.bind(("127.0.0.1", 7410 + 250 * chosen + 2 * participant))
         assert free_domain_id({}) != chosen
     assert free_domain_id({}) == chosen
+
+
+def test_a_domain_that_another_process_is_about_to_use_is_not_chosen(monkeypatch):
+    monkeypatch.setattr(os, "getpid", lambda: 4242)  # the search of both begins at the same number
+    chosen = free_domain_id({})
+    assert free_domain_id({}) == chosen  # by this process, again
+    monkeypatch.setattr("tactile_resonance.processes._TAKEN", {})
+    other = free_domain_id({})  # as by another
+    assert other != chosen
+    assert hold_domain(other) is None
 
 
 def test_a_domain_that_is_given_is_taken():

@@ -3,7 +3,6 @@
 
 import contextlib
 import os
-import socket
 import sys
 from pathlib import Path
 
@@ -15,16 +14,15 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 @contextlib.contextmanager
 def _fresh_domain():
-    """Environment of a domain that tests beside these do not take: a port of it is held meanwhile."""
-    from tactile_resonance.processes import domain_is_free
+    """Environment of a domain that no other test has, also none of this process."""
+    from tactile_resonance.processes import domain_is_free, hold_domain
 
-    with pytest.MonkeyPatch.context() as patch, socket.socket() as held:
+    with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
         for step in range(100):
             number = 1 + (os.getpid() + step) % 100
-            if domain_is_free(number):
-                with contextlib.suppress(OSError):
-                    held.bind(("127.0.0.1", 7400 + 250 * number))  # of TCP, which no node uses
-                    break
+            if domain_is_free(number) and (held := hold_domain(number)):
+                stack.enter_context(held)
+                break
         else:
             raise RuntimeError("no ROS domain is free")
         patch.setenv("ROS_DOMAIN_ID", str(number))

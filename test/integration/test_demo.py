@@ -114,9 +114,10 @@ def start(folder, domain):
         text=True,
     )
     deadline = time.monotonic() + HANGS_S
-    while len(processes_of(domain)) < 1 + NODES and time.monotonic() < deadline:
+    while len(processes_of(domain)) < 1 + NODES:
+        assert demo.poll() is None, f"ended with {demo.returncode}: {demo.communicate()}"
+        assert time.monotonic() < deadline, processes_of(domain)
         time.sleep(0.1)
-    assert len(processes_of(domain)) >= 1 + NODES
     return demo
 
 
