@@ -253,7 +253,8 @@ def _identify(
         suspect &= level_known | (level > ROUNDED)
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
         kind = np.where(level_known, kind, len(KINDS))
-    systematic = np.zeros((batch, structure.order // 2, 2, 2))
+    needed = np.zeros((batch, structure.order // 2), bool)  # none is dispensable
+    systematic = np.zeros((*needed.shape, 2, 2))
     if suspect.any():
         rows = np.flatnonzero(suspect)
         poles = modes_in_band(fit.model.poles_rad_s()[rows], band_hz)
@@ -274,6 +275,7 @@ def _identify(
         noise=np.full((batch, 2), np.nan),
         systematic=systematic,
         lacking=np.full((batch, 3), np.nan),
+        dispensable=needed if fit.dispensable is None else fit.dispensable,
         remark=np.full(batch, "", object),
     )
     return assemble(judged, fit.model, structure, band_hz, shape, method)
@@ -300,6 +302,7 @@ def _nothing(plan: LinesPlan, lines: IntArray) -> Judged:
         noise=np.full((batch, 2), np.nan),
         systematic=np.zeros((batch, structure.order // 2, 2, 2)),
         lacking=np.full((batch, 3), np.nan),
+        dispensable=np.zeros((batch, structure.order // 2), bool),
         remark=np.full(batch, "", object),
     )
 

@@ -262,6 +262,7 @@ def _alone(fitted: _Round, usable: BoolArray, last: bool) -> Judged:
         noise=level.noise,
         systematic=_systematic(plan, data, solution.theta, wrong),
         lacking=lacking,
+        dispensable=np.zeros((batch, plan.structure.order // 2), bool),
         remark=np.full(batch, "", object),
     )
 
@@ -374,6 +375,7 @@ def _judged(fitted: _Round, first: _Round, usable: BoolArray) -> Judged:
         noise=fitted.noise * levels.noise_level(suspect)[:, None],
         systematic=_systematic(plan, fitted.data, theta, suspect),
         lacking=np.full((batch, 3), np.nan),
+        dispensable=np.zeros((batch, plan.structure.order // 2), bool),
         remark=np.full(batch, "", object),
     )
     return _each_by_itself(judged, first)

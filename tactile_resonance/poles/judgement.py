@@ -57,6 +57,8 @@ class Judged:
         total covariance; 0 where nothing does.
     lacking : (batch, 3) float
         See `PolesBatch`.
+    dispensable : (batch, places) bool
+        Modes without which the fit is as good; see `exchange`.
     remark : (batch,) object
         A further note for people; empty: none.
     """
@@ -76,6 +78,7 @@ class Judged:
     noise: FloatArray
     systematic: FloatArray
     lacking: FloatArray
+    dispensable: BoolArray
     remark: npt.NDArray[np.object_]
 
     def rows(self, which: IntArray) -> Judged:
@@ -155,6 +158,7 @@ def assemble(
             quantities[name][undetermined] = np.nan
     poles = quantities["poles_rad_s"]
     significant = significant_modes(model, quantities, covariance, judged.lines)
+    significant &= ~judged.dispensable
     code = np.full(hopeless.shape, STATUS_CODE[PolesStatus.OK], np.uint8)
     with np.errstate(invalid="ignore"):
         # the gravest last, so that it stays

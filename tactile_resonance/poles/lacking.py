@@ -69,14 +69,7 @@ class Directions:
             The variable of the model there.
         numerator_order : int
         """
-        low, high = frequency_hz[0], frequency_hz[-1]
-        half_width = np.median(np.diff(frequency_hz))
-        poles = [np.empty(0, complex)]
-        while half_width <= WIDEST * (high - low) * (1 + 1e-9):
-            places = 1 + int(np.ceil((high - low) / (GRID * half_width)))
-            poles.append(-half_width + 1j * np.linspace(low, high, places))
-            half_width *= 2
-        pole = np.asarray(2 * np.pi * np.concatenate(poles), complex)
+        pole = poles_tried(frequency_hz)
         s = 2j * np.pi * frequency_hz[:, None]
         above, below = 1 / (s - pole), 1 / (s - pole.conj())
         phi = np.stack([above + below, 1j * (above - below)], axis=-1)  # (K, N, 2)
@@ -85,6 +78,20 @@ class Directions:
         modes = np.ascontiguousarray(np.stack([phi.real, phi.imag], axis=2))
         more = PolynomialBasis.on_lines(x, numerator_order + 2).values[:, numerator_order + 1 :]
         return cls(pole, modes, np.ascontiguousarray(more))
+
+
+def poles_tried(frequency_hz: FloatArray) -> ComplexArray:
+    """(N,) poles of modes above the real axis [rad/s], of all widths that lines (K,) may show."""
+    lines = np.arange(frequency_hz.size)
+    spacing = np.gradient(frequency_hz)
+    poles, width = [np.empty(0, complex)], 1
+    while width <= WIDEST * lines[-1] * (1 + 1e-9):
+        at = np.linspace(0, lines[-1], 1 + int(np.ceil(lines[-1] / (GRID * width))))
+        poles.append(
+            -width * np.interp(at, lines, spacing) + 1j * np.interp(at, lines, frequency_hz)
+        )
+        width *= 2
+    return np.asarray(2 * np.pi * np.concatenate(poles), complex)
 
 
 @np.errstate(invalid="ignore")

@@ -17,6 +17,7 @@ from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.bins import BinData, Problem
 from tactile_resonance.poles.covariance import modes_in_band
+from tactile_resonance.poles.exchange import dispensable, exchanged, moved_to
 from tactile_resonance.poles.fit import (
     DenseSolution,
     Linearised,
@@ -26,7 +27,7 @@ from tactile_resonance.poles.fit import (
     start_values,
 )
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, richer
+from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, poorer, richer
 from tactile_resonance.poles.split import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -59,6 +60,8 @@ class LinesFit:
         Weighted residuals; 0 on lines that were left out.
     jacobian : (batch, F, 2, n) float or None
         Of real and imaginary parts of the weighted residuals, where each point was fitted alone.
+    dispensable : (batch, places) bool or None
+        Modes in the band without which the fit is as good, where any was looked for; see `exchange`.
     """
 
     theta: FloatArray
@@ -69,6 +72,7 @@ class LinesFit:
     converged: BoolArray
     residual: ComplexArray
     jacobian: FloatArray | None = None
+    dispensable: BoolArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +109,16 @@ class LinesPlan:
         """With one mode more."""
         return LinesPlan.on_lines(self.frequency_hz, richer(self.structure), self.band_hz)
 
+    @property
+    def poorer(self) -> LinesPlan:
+        """With one mode less."""
+        return LinesPlan.on_lines(self.frequency_hz, poorer(self.structure), self.band_hz)
+
     def fit(self, data: BinData) -> LinesFit:
         """Fit of all points of a batch."""
         batch = len(data.y_planes)
         if self.structure.order > LARGEST_BATCHED_ORDER:
-            return self.rebased(data)._fit_dense(data)
+            return self.settled(data)._fit_dense(data)
         if self.structure.delay:
             return self._fit_dense(data)
         solution = minimise(self.problem, data)
@@ -160,42 +169,68 @@ class LinesPlan:
         """
         usable = np.isfinite(data.variance_y).any(axis=(-2, -1))
         row = data.rows(slice(int(np.argmax(usable)), int(np.argmax(usable)) + 1))
-        y, u = row.y[0, 0], row.u[0, 0]
-        variance = np.broadcast_to(row.variance_y[0, 0], y.shape)
-        x = self.variable.of_frequency(self.frequency_hz)
         order = self.structure.order
         plan = self
-        size = np.ones(y.size)
+        size = np.ones(self.frequency_hz.size)
         for _ in range(REBASE_ITERATIONS):
-            weight = 1 / (variance * size)
-            weight_y, weight_u = weight * np.abs(y) ** 2, weight * np.abs(u) ** 2
-            mean_y, mean_u = weight_y.mean(), weight_u.mean()
-            if not (np.isfinite([mean_y, mean_u]).all() and mean_y > 0 and mean_u > 0):
+            of_size = plan.of_size(row, size)
+            if of_size is None:
                 break
-            denominator = PolynomialBasis.on_lines(x, order, weight_y / mean_y)
-            numerator = PolynomialBasis.on_lines(
-                x, self.structure.numerator_order, weight_u / mean_u
-            )
-            if not np.isfinite([denominator.hessenberg.sum(), numerator.hessenberg.sum()]).all():
-                break
-            problem = Problem.of_lines(denominator.values, numerator.values)
-            plan = LinesPlan(
-                self.frequency_hz,
-                self.structure,
-                self.band_hz,
-                problem,
-                self.variable,
-                denominator,
-                numerator,
-            )
-            theta = linear_step(problem, row, np.sqrt(size))
-            last, size = size, np.abs(denominator.values @ np.append(theta[:order], 1.0)) ** 2
+            plan = replace(of_size, start_size=None)
+            theta = linear_step(plan.problem, row, np.sqrt(size))
+            last, size = size, np.abs(plan.problem.denominator @ np.append(theta[:order], 1.0)) ** 2
             if not (np.isfinite(size).all() and (size > 0).all()):
                 break
             plan = replace(plan, start_size=np.sqrt(size))
             if np.ptp(np.log(size / last)) < REBASE_TOLERANCE:
                 break
         return plan
+
+    def settled(self, data: BinData) -> LinesPlan:
+        """Plan with bases that suit the deepest minimum of the first point with finite weights."""
+        plan = self.rebased(data)
+        if self.structure.delay:
+            return plan
+        usable = np.isfinite(data.variance_y).any(axis=(-2, -1))
+        row = data.rows(slice(int(np.argmax(usable)), int(np.argmax(usable)) + 1))
+        found = least_squares(plan.problem, row, None, None, plan.start_size)
+        return exchanged(plan, row, found)[0] if np.isfinite(found.cost) else plan
+
+    def _dispensable(self, solutions: list[DenseSolution], data: BinData, modes: ComplexArray) -> BoolArray:
+        """(batch, places) for which of the modes (batch, places) in the band the others would do."""
+        out = np.zeros(modes.shape, bool)
+        if self.structure.delay or self.structure.order <= LARGEST_BATCHED_ORDER:
+            return out
+        for k, solution in enumerate(solutions):
+            if solution.converged:
+                poles = dispensable(self, data.rows(slice(k, k + 1)), solution)
+                out[k] = np.isclose(modes[k][:, None], poles, 1e-6, 0).any(axis=-1)
+        return out
+
+    def of_size(self, row: BinData, size: FloatArray) -> LinesPlan | None:
+        """Plan with bases orthonormal in the weights of a point where ``|A|^2`` is `size` (F,).
+
+        None where weights are not finite.
+        """
+        y, u = row.y[0, 0], row.u[0, 0]
+        weight = 1 / (np.broadcast_to(row.variance_y[0, 0], y.shape) * size)
+        weight_y, weight_u = weight * np.abs(y) ** 2, weight * np.abs(u) ** 2
+        mean_y, mean_u = weight_y.mean(), weight_u.mean()
+        if not (np.isfinite([mean_y, mean_u]).all() and mean_y > 0 and mean_u > 0):
+            return None
+        x, structure = self.variable.of_frequency(self.frequency_hz), self.structure
+        denominator = PolynomialBasis.on_lines(x, structure.order, weight_y / mean_y)
+        numerator = PolynomialBasis.on_lines(x, structure.numerator_order, weight_u / mean_u)
+        if not np.isfinite([denominator.hessenberg.sum(), numerator.hessenberg.sum()]).all():
+            return None
+        problem = Problem.of_lines(denominator.values, numerator.values)
+        return replace(
+            self,
+            problem=problem,
+            denominator_basis=denominator,
+            numerator_basis=numerator,
+            start_size=np.sqrt(size),
+        )
 
     def propagated(self, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:
         """Covariance (batch, n, n) of a fit where the variance (batch, F) is not that of `data`."""
@@ -239,15 +274,18 @@ class LinesPlan:
         covariances, conditions = zip(*(s.covariance() for s in solutions), strict=True)
         delay_s = theta[:, -1] * unit_s if phase is not None else 0.0
         a, b, _ = self.problem.sizes
+        model = self.model_of(theta, delay_s)
+        modes = modes_in_band(model.poles_rad_s(), self.band_hz)
         return LinesFit(
             theta[:, : a + b],
-            self.model_of(theta, delay_s),
+            model,
             np.array([s.cost for s in solutions]),
             0.5 * np.stack(covariances),
             np.array(conditions),
             np.array([s.converged for s in solutions]),
             np.stack([s.turned[0] for s in solutions]),
             np.stack([s.jacobian[0] for s in solutions]),
+            self._dispensable(solutions, data, modes),
         )
 
     def _best_of_starts(self, row: BinData, phase: FloatArray | None) -> DenseSolution:
@@ -256,7 +294,10 @@ class LinesPlan:
         for start in self._starts(row, phase):
             solutions.append(least_squares(self.problem, row, start, phase, self.start_size))
         finite = [s for s in solutions if np.isfinite(s.cost)]
-        return min(finite or solutions, key=lambda s: s.cost)
+        best = min(finite or solutions, key=lambda s: s.cost)
+        if phase is None and finite and self.structure.order > LARGEST_BATCHED_ORDER:
+            best = moved_to(self, row, *exchanged(self, row, best))
+        return best
 
     def _starts(self, row: BinData, phase: FloatArray | None) -> list[FloatArray | None]:
         if phase is None:

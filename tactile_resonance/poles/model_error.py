@@ -163,3 +163,10 @@ def richer(structure: ModelStructure) -> ModelStructure:
     return replace(
         structure, order=structure.order + 2, numerator_order=structure.numerator_order + 2
     )
+
+
+def poorer(structure: ModelStructure) -> ModelStructure:
+    """One mode less, as many residual terms."""
+    return replace(
+        structure, order=structure.order - 2, numerator_order=structure.numerator_order - 2
+    )

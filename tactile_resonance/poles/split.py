@@ -80,32 +80,55 @@ def _split_starts(
         roots = model.variable.of_s(np.concatenate([kept, pair, pair.conj()]))
         if roots.size != a:
             continue
-        start[k] = _coefficients(problem, data.rows(slice(k, k + 1)), model, roots)
+        hessenberg = model.denominator_basis.hessenberg
+        theta = coefficients_of_roots(problem, data.rows(slice(k, k + 1)), hessenberg, roots)
+        start[k, :, :shared], start[k, :, shared:] = theta[:shared], theta[shared:].reshape(records, own)
     return start, np.isfinite(start).all(axis=(1, 2))
 
 
-def _coefficients(
-    problem: Problem, data: BinData, model: RationalModel, roots: ComplexArray
+def coefficients_of_roots(
+    problem: Problem, data: BinData, hessenberg: FloatArray, roots: ComplexArray
 ) -> FloatArray:
-    """(M, n) with these roots of A, and the B and C that fit best."""
+    """Coefficients with given roots of A, and the B and C that fit best.
+
+    Parameters
+    ----------
+    problem : Problem
+    data : BinData
+        Of one point.
+    hessenberg : (a + 1, a) float
+        Of the basis of A.
+    roots : (a,) complex
+        In the variable of the polynomials.
+
+    Returns
+    -------
+    (a + b + M c,) float
+        [A without its last, B, C of each record].
+    """
     a, b, own = problem.sizes
-    shared, records = a + b, data.records
-    basis, hessenberg = problem.denominator, model.denominator_basis.hessenberg
+    basis = problem.denominator
     x = hessenberg[0, 0] + hessenberg[1, 0] * basis[:, 1]  # (K,) of the bins: x p_0 of the basis
-    values = np.prod(x[:, None] - roots, axis=-1)
-    values /= np.linalg.norm(values)
-    denominator = np.linalg.lstsq(
-        np.concatenate([basis.real, basis.imag]), np.concatenate([values.real, values.imag]), rcond=None
-    )[0]
-    theta = np.zeros(shared + records * own)
+    logarithm = np.sum(np.log(x[:, None] - roots), axis=-1)  # many factors over decades overflow
+    phase = np.exp(1j * logarithm.imag)  # A / |A|
+    weighted = basis * np.exp(np.mean(logarithm.real) - logarithm.real)[:, None]
+    denominator = _real_solution(weighted, phase)
+    theta = np.zeros(a + b + data.records * own)
     theta[:a] = denominator[:-1] / denominator[-1]
     linear = Linearised.of(problem, data, theta)
-    weight = 1 / np.sqrt(linear.variance)[..., None]
-    columns = (linear.slope[..., a:] * weight).reshape(-1, theta.size - a)
-    error = (linear.error[..., None] * weight).ravel()
-    rows = np.concatenate([columns.real, columns.imag])
-    found = np.linalg.lstsq(rows, np.concatenate([error.real, error.imag]), rcond=None)[0]
-    out = np.empty((records, shared + own))
-    out[:, :a], out[:, a:shared] = theta[:a], found[:b]
-    out[:, shared:] = found[b:].reshape(records, own)
-    return out
+    used = np.isfinite(linear.variance)
+    weight = 1 / np.sqrt(linear.variance[used])
+    theta[a:] = _real_solution(
+        linear.slope[used][:, a:] * weight[:, None], linear.error[used] * weight
+    )
+    return theta
+
+
+def _real_solution(matrix: ComplexArray, right: ComplexArray) -> FloatArray:
+    """Real least squares solution of complex equations, whatever the scales of its unknowns."""
+    rows = np.concatenate([matrix.real, matrix.imag])
+    scale = np.linalg.norm(rows, axis=0)
+    right = np.concatenate([right.real, right.imag])
+    if not (np.isfinite(rows).all() and np.isfinite(right).all() and (scale > 0).all()):
+        return np.full(scale.size, np.nan)
+    return np.linalg.lstsq(rows / scale, right, rcond=None)[0] / scale

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models of many modes: those that sit where there is none are moved to where one is missing, or left out.
+
+Sanathanan-Koerner iterations place some poles of a model of many on noise, for noise enters their equations
+with the model's own denominator. From there a fit ends in a minimum in which a true mode is not fitted at
+all. The score test of `lacking` shows where one is missing; the fit begins anew with a mode there in place of
+the one that is missed least, and so on while the cost falls.
+
+A wide mode across others is the hull of all of them where noise hides each alone. Its residue seems certain,
+while the others would take its place: it counts only where the model without it, fitted anew, is worse than
+noise explains (Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
+section 11.3: twice the fall of the cost is chi-square).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import special
+
+from tactile_resonance._typing import ComplexArray, FloatArray
+from tactile_resonance.poles.basis import PolynomialBasis
+from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.fit import DenseSolution, least_squares
+from tactile_resonance.poles.lacking import poles_tried
+from tactile_resonance.poles.likelihood import LEAST_LEFT
+from tactile_resonance.poles.significance import NOISE_PASSES_FOR_A_MODE
+from tactile_resonance.poles.split import coefficients_of_roots
+
+if TYPE_CHECKING:
+    from tactile_resonance.poles.lines_fit import LinesPlan
+
+# A mode is moved to where noise makes as much less often than this: a start that is no use costs time alone.
+CHANCE = 0.3
+# Starts that are tried before a minimum is taken for the deepest, those of the least cost first.
+STARTS = 3
+# Poles nearer than this part of a half width are of the same mode.
+SAME = 0.5
+# Of a mode: natural frequency, damping ratio, and a residue.
+PARAMETERS_OF_A_MODE = 4
+
+
+@np.errstate(all="ignore")
+def exchanged(
+    plan: LinesPlan, row: BinData, found: DenseSolution
+) -> tuple[LinesPlan, DenseSolution]:
+    """The deepest minimum that is found by moving modes.
+
+    Parameters
+    ----------
+    plan : LinesPlan
+    row : BinData
+        Of one point.
+    found : DenseSolution
+        Where to begin.
+
+    Returns
+    -------
+    plan : LinesPlan
+        With bases that suit the solution.
+    found : DenseSolution
+    """
+    tried = poles_tried(plan.frequency_hz)
+    for _ in range(2 * plan.structure.order):
+        missing, chance = _most_lacking(plan, row, found, tried)
+        if not chance < np.log(CHANCE):
+            break
+        more = np.array([missing, np.conj(missing)])
+        starts = [np.append(rest, more) for rest in _one_less(_poles(plan, found))]
+        starts.sort(key=lambda poles: _linear_cost(plan, row, poles))
+        for start in starts[:STARTS]:
+            again = _minimum_from(plan, row, start)
+            if again is not None and again[1].cost < found.cost * (1 - 1e-9):
+                plan, found = again
+                break
+        else:
+            break
+    return plan, found
+
+
+@np.errstate(all="ignore")
+def moved_to(
+    plan: LinesPlan, row: BinData, there: LinesPlan, found: DenseSolution
+) -> DenseSolution:
+    """A solution of one plan as that of another one."""
+    if there is plan:
+        return found
+    start = _coefficients(plan, row, _poles(there, found))
+    return least_squares(plan.problem, row, start, None, plan.start_size)
+
+
+@np.errstate(all="ignore")
+def dispensable(plan: LinesPlan, row: BinData, found: DenseSolution) -> ComplexArray:
+    """(N,) poles above the real axis [rad/s] of modes across others that take their place in a new fit.
+
+    Parameters
+    ----------
+    plan : LinesPlan
+    row : BinData
+        Of one point.
+    found : DenseSolution
+        Its fit.
+    """
+    poles = _poles(plan, found)
+    above = poles[poles.imag > 0]
+    lines = int(np.isfinite(_variance(plan, row)).sum())
+    fall = special.chdtri(PARAMETERS_OF_A_MODE, NOISE_PASSES_FOR_A_MODE / lines) / 2
+    limit = fall * found.cost / (lines - found.theta.size / 2)
+    out = []
+    for k, pole in enumerate(above):
+        apart = np.abs(np.delete(above, k).imag - pole.imag)
+        if not (apart < abs(pole.real)).any():
+            continue
+        without = _minimum_from(plan.poorer, row, _without(poles, k))
+        if without is None:
+            continue
+        there, fit = exchanged(without[0], row, without[1])
+        # one of the others that noise made may have become this one, which is needed then
+        again = np.abs(_poles(there, fit) - pole) < SAME * abs(pole.real)
+        if fit.cost < found.cost + limit and not again.any():
+            out.append(pole)
+    return np.array(out, complex)
+
+
+def _poles(plan: LinesPlan, solution: DenseSolution) -> ComplexArray:
+    return plan.model_of(solution.theta[None]).poles_rad_s()[0]
+
+
+def _coefficients(plan: LinesPlan, row: BinData, poles: ComplexArray) -> FloatArray:
+    roots = plan.variable.of_s(poles)
+    return coefficients_of_roots(plan.problem, row, plan.denominator_basis.hessenberg, roots)
+
+
+def _minimum_from(
+    plan: LinesPlan, row: BinData, poles: ComplexArray
+) -> tuple[LinesPlan, DenseSolution] | None:
+    """Fit that begins with these poles, of a plan with bases that suit them; None where there is none."""
+    x = plan.variable.of_frequency(plan.frequency_hz)
+    logarithm = 2 * np.sum(np.log(np.abs(x[:, None] - plan.variable.of_s(poles))), axis=-1)
+    there = plan.of_size(row, np.exp(logarithm - logarithm.mean()))
+    start = None if there is None else _coefficients(there, row, poles)
+    if there is None or start is None or not np.isfinite(start).all():
+        return None
+    solution = least_squares(there.problem, row, start, None, there.start_size)
+    return (there, solution) if np.isfinite(solution.cost) else None
+
+
+def _without(poles: ComplexArray, k: int) -> ComplexArray:
+    """All but the k-th complex pair, in the order of the poles above the real axis."""
+    above, below = poles[poles.imag > 0], poles[poles.imag < 0]
+    mirrored = np.argmin(np.abs(below - above[k].conj()))
+    real = np.sort_complex(poles[poles.imag == 0])
+    return np.concatenate([np.delete(above, k), np.delete(below, mirrored), real])
+
+
+def _one_less(poles: ComplexArray) -> list[ComplexArray]:
+    """All but each complex pair, and all but two real poles next to each other."""
+    is_complex = poles.imag != 0
+    real = np.sort_complex(poles[~is_complex])
+    pairs = [np.append(poles[is_complex], np.delete(real, [k, k + 1])) for k in range(0, real.size - 1, 2)]
+    return [_without(poles, k) for k in range(int((poles.imag > 0).sum()))] + pairs
+
+
+def _most_lacking(
+    plan: LinesPlan, row: BinData, solution: DenseSolution, tried: ComplexArray
+) -> tuple[complex, float]:
+    """The mode that is missed most, and the logarithm of how likely noise alone misses it; see `lacking`."""
+    variance = _variance(plan, row)
+    used = np.isfinite(variance)
+    jacobian = solution.jacobian[0][used].reshape(-1, solution.theta.size)
+    basis = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0]
+    residual = np.ascontiguousarray(solution.residual[0][used]).view(float)
+    s = 2j * np.pi * plan.frequency_hz[used][:, None]
+    above, below = 1 / (s - tried), 1 / (s - tried.conj())
+    weight = np.abs(tried.real) / np.sqrt(variance[used])[:, None] * row.u[0, 0][used][:, None]
+    pair = np.stack([(above + below) * weight, 1j * (above - below) * weight])  # (2, K, N)
+    pair = np.stack([pair.real, pair.imag], axis=2).reshape(2, -1, tried.size)
+    whole = np.sum(pair[0] ** 2, axis=0) * np.sum(pair[1] ** 2, axis=0)
+    pair = pair - basis @ (basis.T @ pair)
+    score = residual @ pair  # (2, N)
+    p_00, p_11, p_01 = (np.sum(pair[i] * pair[j], axis=0) for i, j in ((0, 0), (1, 1), (0, 1)))
+    determinant = p_00 * p_11 - p_01**2
+    fall = (p_11 * score[0] ** 2 - 2 * p_01 * score[0] * score[1] + p_00 * score[1] ** 2) / determinant
+    fall[~(determinant > LEAST_LEFT * whole)] = 0.0
+    k = int(np.argmax(fall))
+    dof = used.sum() - solution.theta.size / 2
+    return complex(tried[k]), float((dof - 1) * np.log1p(-fall[k] / solution.cost) + np.log(tried.size))
+
+
+def _variance(plan: LinesPlan, row: BinData) -> FloatArray:
+    """(F,) of Y."""
+    return np.broadcast_to(row.variance_y[0, 0], plan.frequency_hz.shape)
+
+
+def _linear_cost(plan: LinesPlan, row: BinData, poles: ComplexArray) -> float:
+    """Cost with given poles and the residues that fit best, of a variance that does not depend on them."""
+    roots = plan.variable.of_s(poles)
+    x = plan.variable.of_frequency(plan.frequency_hz)[:, None]
+    above, real = roots[roots.imag > 0], roots[roots.imag == 0]
+    first, second, single = 1 / (x - above), 1 / (x - above.conj()), 1 / (x - real)
+    terms = plan.structure.numerator_order - plan.structure.order
+    rest = PolynomialBasis.on_lines(x[:, 0], max(terms, 0)).values if terms >= 0 else np.empty((x.size, 0))
+    columns = np.concatenate([first + second, 1j * (first - second), single, rest], axis=1)
+    variance = _variance(plan, row)
+    used = np.isfinite(variance)
+    weight = 1 / np.sqrt(variance[used])
+    columns = columns[used] * (weight * row.u[0, 0][used])[:, None]
+    rows = np.concatenate([columns.real, columns.imag])
+    rows /= np.linalg.norm(rows, axis=0)
+    y = row.y[0, 0][used] * weight
+    right = np.concatenate([y.real, y.imag])
+    if not np.isfinite(rows).all():
+        return np.inf
+    basis = np.linalg.qr(rows)[0]
+    return float(right @ right - np.sum((basis.T @ right) ** 2))
