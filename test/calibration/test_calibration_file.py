@@ -48,6 +48,21 @@ def test_a_damaged_file_is_refused_by_field(written, old, new, message):
         read_calibration(written)
 
 
+def test_a_covariance_is_symmetric_but_for_rounding(given, tmp_path):
+    """An inverse leaves what is uncorrelated different by its rounding, however small both are."""
+    path, size = tmp_path / "sensor.yaml", given.std.size
+    for off, refused in ((1e-12, False), (1e-3, True)):
+        covariance = np.eye(size)
+        covariance[0, 1] = off
+        sensor = CalibratedSensor(replace(given, covariance=covariance), 2.5e-3, np.nan, np.nan, {})
+        path.write_text(sensor.as_text())
+        if refused:
+            with pytest.raises(ValueError, match="covariance: got .*; accepted is a symmetric one"):
+                read_calibration(path)
+        else:
+            np.testing.assert_array_equal(read_calibration(path).calibration.covariance, covariance)
+
+
 def test_the_tip_mass_is_that_of_the_ball(fitted, bench):
     mass_kg, std_kg, why = tip_mass(fitted.calibration)
     assert why == ""
