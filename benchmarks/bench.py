@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -21,12 +20,10 @@ import scipy.signal
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.multisine import Excitation, design_multisine
 from tactile_resonance.simulation.plant.tip import SprungIndenter
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.changing_contact import ContactHistory
-from tactile_resonance.simulation.sensor.linear import Lines, sample_period
+from tactile_resonance.simulation.sensor.bench import BenchEffects, SimulatedBench
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream, nonlinear_steady_state
-from tactile_resonance.simulation.sensor.response import ResponseStream
+from tactile_resonance.simulation.sensor.response import Lines, ResponseStream, sample_period
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import read_tissues
 
@@ -54,10 +51,10 @@ class Setup:
         self.excitation: Excitation = design_multisine()
         self.narrow: Excitation = design_multisine(band_hz=(200.0, 300.0))
         self.strong: Excitation = design_multisine(level_v=4.0)
-        cortex = self.library["cortex"]
-        self.creep = ContactHistory.under_force(
-            cortex, self.bench.sensor.tip.radius_m, self.bench.contact, duration_s=SIGNAL_S
-        )
+
+    def creeping(self, time_s: float) -> CoupledBimorph:
+        """Cortex, after a second and so long under a held force."""
+        return self.bench.coupled(self.library["cortex"], hold_time_s=1.0 + time_s)
 
     def play(self, excitation: Excitation, effects: BenchEffects) -> Callable:
         """All periods of both channels, from rest; everything is made anew."""
@@ -97,7 +94,7 @@ def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, flo
         return scipy.fft.rfft(u), scipy.fft.rfft(y)
 
     def creep() -> object:
-        run = setup.bench.start_varying(partial(setup.creep.coupled_at, setup.bench.sensor), effects=IDEAL)
+        run = setup.bench.start_varying(setup.creeping, effects=IDEAL)
         return run.block(setup.excitation, PERIODS)
 
     def lsim() -> object:
@@ -168,8 +165,9 @@ def measure_accuracy(setup: Setup, settling: int) -> tuple[dict, dict, dict]:
     exact = model.frequency_response(lines.frequency_hz)
     frequency = lines.frequency_hz
     stream = ResponseStream(model)
-    stream.skip(lines, 5000)  # 2000 s
-    g = _spectrum(stream.play(lines))[lines.harmonics]
+    for _ in range(5000):  # 2000 s
+        settled = stream.play(lines)
+    g = _spectrum(settled)[lines.harmonics]
     g = g / _spectrum(sample_period(lines))[lines.harmonics]
     a, b, c, d = setup.bench.coupled(setup.tissue).state_space
     system = scipy.signal.StateSpace(a, b[:, None], c[None], [[d]])
@@ -187,7 +185,7 @@ def measure_accuracy(setup: Setup, settling: int) -> tuple[dict, dict, dict]:
     # distortion: all that a linear sensor would not give, at the lines of the record below 10 kHz
     strong = Lines.of(setup.strong)
     clean = sample_period(strong, model.frequency_response(strong.frequency_hz))
-    reference = nonlinear_steady_state(model, setup.nonlinear, strong, oversampling=16).sensor_v
+    reference = nonlinear_steady_state(model, setup.nonlinear, strong, oversampling=16)
 
     def marched(oversampling: int) -> Array:
         stream = NonlinearStream(model, setup.nonlinear, oversampling=oversampling)
@@ -200,10 +198,8 @@ def measure_accuracy(setup: Setup, settling: int) -> tuple[dict, dict, dict]:
         "march, 8-fold": marched(8),
         "Picard iteration over the period, 4-fold": nonlinear_steady_state(
             model, setup.nonlinear, strong
-        ).sensor_v,
-        "the same, 8-fold": nonlinear_steady_state(
-            model, setup.nonlinear, strong, oversampling=8
-        ).sensor_v,
+        ),
+        "the same, 8-fold": nonlinear_steady_state(model, setup.nonlinear, strong, oversampling=8),
     }
     band = (frequency >= 200) & (frequency <= 300)
     truth = _spectrum(reference - clean)[strong.harmonics]

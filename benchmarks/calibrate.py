@@ -31,8 +31,7 @@ from benchmarks.skip_decision import INSIDE, TISSUES
 from tactile_resonance.calibration.contact import ContactStatus
 from tactile_resonance.files import write_whole
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import BenchRun
+from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
 from tactile_resonance.simulation.sensor.bimorph import couple
 from tactile_resonance.simulation.tissue.hertz import hertz_contact
 

@@ -3,28 +3,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 
 from benchmarks.skip_point import SimulatedPoint, pole_of
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.contact import TissueContact
-from tactile_resonance.calibration.contact_record import ContactRecord
-from tactile_resonance.calibration.estimator import CalibratedEstimator
+from tactile_resonance.calibration.estimator import CalibratedEstimator, ContactRecord
 from tactile_resonance.calibration.fit import calibrate
 from tactile_resonance.calibration.model import Calibration
-from tactile_resonance.calibration.tip_mass import tip_mass
+from tactile_resonance.calibration.records import Load
+from tactile_resonance.cantilever import tip_mass
 from tactile_resonance.multisine import Excitation, design_multisine
 from tactile_resonance.record import Record
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.known_loads import (
+from tactile_resonance.simulation.sensor.bench import BenchEffects, SimulatedBench
+from tactile_resonance.simulation.sensor.experiments import (
     another_sensor,
-    records_of_calibration,
+    calibration_records,
     true_sensor,
 )
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -92,22 +90,11 @@ def make_bench(seed: int, skewed: bool) -> CalibratedBench:
     skew_s = SKEW_STD_S * rng.standard_normal() if skewed else 0.0
     bench = SimulatedBench(another_sensor(read_sensor(), seed), library().contact)
     weighs_kg = MASS_KG * (1 + MASS_RELATIVE_STD * rng.standard_normal())
-    made, harmonics, rate_hz = records_of_calibration(
+    made = calibration_records(
         bench, masses_kg=[weighs_kg], effects=BenchEffects(channel_skew_s=skew_s), seed=100 * seed
     )
-    records = [
-        CalibrationRecord.of_samples(
-            u,
-            y,
-            sample_rate_hz=rate_hz,
-            harmonics=harmonics,
-            load=Load(kind),
-            value=MASS_KG if kind == "mass" else 0.0,
-            value_std=MASS_RELATIVE_STD * MASS_KG if kind == "mass" else 0.0,
-            name=kind,
-        )
-        for kind, _, u, y in made
-    ]
+    stated = {"value": MASS_KG, "value_std": MASS_RELATIVE_STD * MASS_KG}
+    records = [replace(of, **stated) if of.load is Load.MASS else of for of in made]
     calibration = calibrate(records).calibration
     truth = true_sensor(bench, skew_s).values
     off = np.full(calibration.std.size, np.nan)

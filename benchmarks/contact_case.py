@@ -21,7 +21,7 @@ from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Ball, Indenter
 from tactile_resonance.simulation.ur5e.tracking import TrackingParameters

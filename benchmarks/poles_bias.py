@@ -13,8 +13,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.bench import BenchEffects, SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 TISSUES = ("gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver")

@@ -8,12 +8,10 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Record
-from tactile_resonance.simulation.sensor.acquisition import convert
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
-from tactile_resonance.simulation.sensor.linear import Lines, sample_period
+from tactile_resonance.simulation.sensor.bench import SimulatedBench, convert
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, VaryingStream
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
-from tactile_resonance.simulation.sensor.response import ResponseStream, VaryingStream
+from tactile_resonance.simulation.sensor.response import Lines, ResponseStream, sample_period
 from tactile_resonance.simulation.tissue.hertz import Tissue
 
 

@@ -27,7 +27,7 @@ from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.surfaces import FlatSurface
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 FORCE_N, SIDE, SPACING_M, BLOCKS_S, START_M = 0.01, 4, 0.005, 0.8, 0.02

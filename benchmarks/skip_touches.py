@@ -21,8 +21,7 @@ from tactile_resonance.scan.standoff import NEAR_M
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import read_tissues
-from tactile_resonance.simulation.tissue.scene import PhantomScene, read_scene
-from tactile_resonance.simulation.tissue.shapes import Sphere
+from tactile_resonance.simulation.tissue.scene import PhantomScene, Sphere, read_scene
 
 PHANTOMS, QUICK_PHANTOMS = 50, 6
 RADIUS_M = (0.006, 0.012)

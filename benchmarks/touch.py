@@ -18,10 +18,9 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.estimator import TouchDetector
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.simulation.plant.tip import SprungIndenter
-from tactile_resonance.simulation.sensor.beam import sensor_modes
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.linear import Lines
-from tactile_resonance.simulation.sensor.response import ResponseStream
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
+from tactile_resonance.simulation.sensor.response import Lines, ResponseStream
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import read_tissues
 

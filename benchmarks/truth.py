@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -34,8 +33,9 @@ from tactile_resonance.poles.result import (
 )
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.simulation.sensor.bench import DEFAULT_EFFECTS, BenchRun, SimulatedBench
-from tactile_resonance.simulation.sensor.changing_contact import ContactHistory, pole_trajectory
-from tactile_resonance.simulation.sensor.linear import Lines
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
+from tactile_resonance.simulation.sensor.changing_contact import pole_trajectory
+from tactile_resonance.simulation.sensor.response import Lines
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 GROUPS, QUICK_GROUPS, CHUNK = 400, 60, 400
@@ -245,22 +245,13 @@ def creep_table(count: int) -> list[str]:
 
 
 def _creep_row(name: str, blocks: int, count: int) -> str:
-    bench, tissue, library = (
-        SimulatedBench.from_configuration(),
-        read_tissues()[name],
-        read_tissues(),
-    )
-    length_s = blocks * 0.4
-    history = ContactHistory.under_force(
-        tissue,
-        bench.sensor.tip.radius_m,
-        library.contact,
-        force_n=CREEP_FORCE_N,
-        since_s=HELD_FROM_S,
-        duration_s=length_s,
-    )
+    bench, tissue, length_s = SimulatedBench.from_configuration(), read_tissues()[name], blocks * 0.4
+
+    def creeping(time_s: float) -> CoupledBimorph:
+        return bench.coupled(tissue, force_n=CREEP_FORCE_N, hold_time_s=HELD_FROM_S + time_s)
+
     place = np.linspace(-1, 1, 8 * blocks + 1)  # of the record
-    track = pole_trajectory(bench.sensor, history, (1 + place) * length_s / 2)
+    track = pole_trajectory(creeping((1 + at) * length_s / 2) for at in place.tolist())
     # as in the estimate, the mean and the straight line nearest to the change
     f0_damping = np.stack(natural_frequency_and_damping(track))  # (2, T)
     mean, slope = np.polynomial.legendre.legfit(place, f0_damping.T, 6)[:2]
@@ -268,8 +259,7 @@ def _creep_row(name: str, blocks: int, count: int) -> str:
     middle = {"force_n": CREEP_FORCE_N, "hold_time_s": HELD_FROM_S + length_s / 2}
     found, constant = [], []
     for seed in range(count):
-        creeping = bench.start_varying(partial(history.coupled_at, bench.sensor), seed=seed)
-        found.append(_poles_of(creeping, blocks, seed))
+        found.append(_poles_of(bench.start_varying(creeping, seed=seed), blocks, seed))
         constant.append(_poles_of(bench.start(tissue, seed=seed, **middle), blocks, seed))
     errors, rates, inside, instants = [], [], [], []
     for poles in found:

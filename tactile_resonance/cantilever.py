@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Eigenvalues and shapes of a uniform cantilever with a tip mass (Euler-Bernoulli).
+"""Eigenvalues and shapes of a uniform cantilever with a tip mass (Euler-Bernoulli), and that mass from them.
 
 Free-vibration equation: Erturk & Inman, *Piezoelectric Energy Harvesting* (2011), appendix C.1, without rotary
 inertia of the tip.
@@ -8,9 +8,16 @@ inertia of the tip.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy import special
+from scipy.optimize import brentq, least_squares
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.calibration.model import Calibration
+
+THEORY_STD = 1e-3
+"""Relative: what glue, shear and a clamp that gives make of the frequencies and shapes of a real beam."""
+CONTRADICTED = 1e-4
+"""Probability of so large residuals by chance, below which modes are not those of such a beam."""
 
 
 def frequency_equation(beta: float, mass_ratio: float) -> float:
@@ -91,3 +98,44 @@ def tip_shape(beta: FloatArray, beam_mass: float, tip_mass: float) -> tuple[Floa
     fall = np.exp(-beta)
     slope = -fall + growing * (1 + fall**2) / 2 + np.sin(beta) + sigma * np.cos(beta)
     return deflection / np.sqrt(modal_mass), beta * slope / np.sqrt(modal_mass)
+
+
+def tip_mass(calibration: Calibration) -> tuple[float, float, str]:
+    """Mass of the tip [kg] and its standard deviation; NaN, and why, where the records do not determine it.
+
+    The beam is taken for a uniform one with a point mass at its end: ratios of frequencies then follow from the
+    ratio of the masses, and the shapes at the tip from the mass of the beam.
+    """
+    nan, model = float("nan"), calibration.model
+    n = model.modes
+    known = np.flatnonzero(calibration.determined[:n] & calibration.determined[3 * n : 4 * n])
+    if known.size < 3:
+        return nan, nan, "three modes of known shape at the tip, or more, are needed"
+    values = np.concatenate([model.natural_rad_s[known], model.tip_deflection[known]])
+    if not values.min() > 0:
+        return nan, nan, "deflections at the tip are not all above 0"
+    index = np.concatenate([known, 3 * n + known])
+    covariance = calibration.covariance[np.ix_(index, index)] / np.outer(values, values)
+    covariance = covariance + THEORY_STD**2 * np.eye(values.size)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def residual(x: FloatArray) -> FloatArray:
+        """Of logarithms: rate, mass of the beam, mass of the tip over it."""
+        ratio = float(np.exp(x[2]))
+        beta = cantilever_eigenvalues(ratio, int(known[-1]) + 1)[known]
+        shape = np.abs(tip_shape(beta, 1.0, ratio)[0])
+        logs = np.concatenate([x[0] + 2 * np.log(beta), np.log(shape) - x[1] / 2])
+        return np.asarray(whiten @ (logs - np.log(values)))
+
+    # a bare cantilever's shapes are 2 at the tip, of a mass of 1
+    start = [np.log(values[0] / 3.5), -2 * np.log(values[known.size] / 2), np.log(0.05)]
+    found = least_squares(residual, start, diff_step=1e-6, bounds=([-50, -50, -12], 50))
+    chance = float(special.chdtrc(values.size - 3, 2 * found.cost))
+    if chance < CONTRADICTED:
+        return nan, nan, "the modes are not those of a uniform cantilever with a point mass"
+    of_x = np.linalg.inv(found.jac.T @ found.jac)
+    mass = float(np.exp(found.x[1] + found.x[2]))
+    std = mass * float(np.sqrt(of_x[1:, 1:].sum()))
+    if std > mass / 4:
+        return nan, nan, f"{1e6 * mass:.3g} +- {1e6 * std:.2g} mg is no statement"
+    return mass, std, ""

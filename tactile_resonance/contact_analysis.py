@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 
 from tactile_resonance.analysis import Analysis, analyse, analysis_as_json
-from tactile_resonance.calibration.contact import ContactStatus, Moduli, TissueContact, moduli
-from tactile_resonance.calibration.contact_record import ContactRecord, Start
-from tactile_resonance.calibration.estimator import CalibratedEstimator
+from tactile_resonance.calibration.contact import ContactStatus, Law, Moduli, TissueContact, moduli
+from tactile_resonance.calibration.estimator import CalibratedEstimator, ContactRecord
 from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
-from tactile_resonance.calibration.law import Law
 from tactile_resonance.fields import band, known, number, require, require_kind
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
@@ -145,7 +143,7 @@ def estimate_contact(
         sample_rate_hz=rate_hz,
         harmonics=harmonics,
         band_hz=band_hz,
-        start=Start.REST if from_rest else Start.UNKNOWN,
+        from_rest=from_rest,
     )
     lines = int(np.count_nonzero(record.excited))
     require(lines > 2, "band_hz", band_hz, f"a band of three excited lines or more ({lines} found)")
@@ -153,8 +151,8 @@ def estimate_contact(
         record, force_n, force_std_n
     )
     black_box = None
-    if contact.message:
-        warnings.append(f"contact: {contact.message}")
+    if contact.poles.message:
+        warnings.append(f"contact: {contact.poles.message}")
     if contact.status is ContactStatus.CONTRADICTED:
         try:
             black_box = analyse(recording, band_hz=band_hz)
@@ -183,8 +181,8 @@ def contact_content(analysis: ContactAnalysis) -> dict[str, Any]:
         "covariance": main.noise.tolist(),
         "total_covariance": main.covariance.tolist(),
         "band_hz": list(contact.poles.band_hz),
-        "chi_square": contact.chi_square,
-        "degrees_of_freedom": contact.degrees_of_freedom,
+        "chi_square": contact.poles.cost,
+        "degrees_of_freedom": int(contact.poles.expected_cost),
         "status": contact.status.value,
         "moduli": {
             "storage_pa": known(found.storage_pa),

@@ -2,7 +2,13 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.multisine import Grid, design_multisine, harmonics_on_grid, mains_lines
+from tactile_resonance.multisine import (
+    Excitation,
+    Grid,
+    design_multisine,
+    harmonics_on_grid,
+    mains_lines,
+)
 
 
 def test_default_is_the_papers_signal():
@@ -145,3 +151,28 @@ def test_crest_factor_of_random_phases_is_near_four():
 def test_bad_input_names_the_field(change, message):
     with pytest.raises(ValueError, match=message):
         design_multisine(**change)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"harmonics": np.array([3, 2])}, "harmonics"),
+        ({"harmonics": np.array([1, 50])}, "harmonics"),
+        ({"harmonics": np.array([], int)}, "harmonics"),
+        ({"phase_rad": np.zeros(1)}, "phase_rad"),
+        ({"amplitude_v": np.array([1.0, np.nan])}, "amplitude_v"),
+        ({"sample_rate_hz": 0.0}, "sample_rate_hz"),
+        ({"samples_per_period": 1}, "samples_per_period"),
+    ],
+)
+def test_lines_that_make_no_signal_are_refused_by_name(change, named):
+    good = {
+        "harmonics": np.array([1, 2]),
+        "amplitude_v": np.ones(2),
+        "phase_rad": np.zeros(2),
+        "sample_rate_hz": 100.0,
+        "samples_per_period": 100,
+    }
+    Excitation(**good)
+    with pytest.raises(ValueError, match=f"{named}.*expected"):
+        Excitation(**(good | change))

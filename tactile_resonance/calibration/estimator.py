@@ -13,23 +13,34 @@ poles about the band are estimated along.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy import special
 
-from tactile_resonance._typing import ComplexArray, FloatArray
-from tactile_resonance.calibration.contact import ContactStatus, TissueContact, slope_of
-from tactile_resonance.calibration.contact_record import ContactRecord, Start
-from tactile_resonance.calibration.law import ContactPrior, ContactStiffness, Law
-from tactile_resonance.calibration.model import Calibration, SensorModel
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance.calibration.contact import (
+    ContactPrior,
+    ContactStatus,
+    Law,
+    TissueContact,
+    slope_of,
+)
+from tactile_resonance.calibration.model import Calibration, ContactStiffness, SensorModel
 from tactile_resonance.fields import require
+from tactile_resonance.frf.band_bins import BandBins
+from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.poles.result import (
     Poles,
     PolesStatus,
     natural_frequency_and_damping,
     natural_frequency_and_damping_jacobian,
 )
+from tactile_resonance.poles.structure import PoleBand
 
 CONTRADICTED = 1e-4
 """Probability of so large residuals by chance, below which data contradict a calibration."""
@@ -42,6 +53,92 @@ _STEPS = 60
 _ENOUGH = 1e-3  # of the weighted squares: a thirtieth of a deviation
 _NEAR = (0.2, 5.0)
 """Of the ends of the band: poles between them have a state of their own where that at the start is unknown."""
+FEWEST_LINES = 3
+"""Excited in the band."""
+IN_AIR_N_PER_M = 1.0
+"""Stiffness below which the tip is in air; tissue at 1 cN has tens."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactRecord:
+    """Bins of a band of one record, and all lines that were excited.
+
+    Attributes
+    ----------
+    frequency_hz : (K,) float
+    y : (K,) complex
+        Sensor [V], scaled by one over the samples.
+    line_hz : (F,) float
+    u : (F,) complex
+        Actuator [V] at the lines.
+    samples : int
+    sample_rate_hz : float
+    from_rest : bool
+        Whether the sensor was at rest at the first sample; otherwise its state there is unknown.
+    """
+
+    frequency_hz: FloatArray
+    y: ComplexArray
+    line_hz: FloatArray
+    u: ComplexArray
+    samples: int
+    sample_rate_hz: float
+    from_rest: bool = True
+
+    @classmethod
+    def of_bins(cls, bins: BandBins) -> ContactRecord:
+        """Of the bins of one realisation from rest that hold all lines that were excited."""
+        require(bins.u.shape[0] == 1, "bins", bins.u.shape, "one realisation")
+        resolution, index = bins.resolution_hz, bins.harmonics * bins.periods
+        return cls(
+            np.asarray((bins.first_bin + np.arange(bins.count)) * resolution, float),
+            bins.y[0],
+            np.asarray(index * resolution, float),
+            bins.u[0, index - bins.first_bin],
+            bins.samples_per_period * bins.periods,
+            bins.sample_rate_hz,
+        )
+
+    @classmethod
+    def of_samples(
+        cls,
+        u: npt.ArrayLike,
+        y: npt.ArrayLike,
+        *,
+        sample_rate_hz: float,
+        harmonics: npt.ArrayLike,
+        band_hz: tuple[float, float],
+        from_rest: bool = True,
+    ) -> ContactRecord:
+        """Of whole periods (P, N) of actuator and sensor [V]."""
+        record = Spectrum.of(u, y)
+        samples = record.periods * record.samples_per_period
+        resolution = sample_rate_hz / samples
+        index = np.asarray(harmonics) * record.periods
+        low, high = band_hz
+        first, last = np.ceil(low / resolution - 1e-9), np.floor(high / resolution + 1e-9)
+        inside = np.arange(max(1, int(first)), min(samples // 2 - 1, int(last)) + 1)
+        return cls(
+            np.asarray(inside * resolution, float),
+            record.bins[0, inside],
+            index * resolution,
+            record.bins[1, index],
+            samples,
+            sample_rate_hz,
+            from_rest,
+        )
+
+    @property
+    def excited(self) -> BoolArray:
+        """(K,) bins that are lines."""
+        return np.isin(
+            np.rint(self.frequency_hz * self.duration_s), np.rint(self.line_hz * self.duration_s)
+        )
+
+    @property
+    def duration_s(self) -> float:
+        """Of the record."""
+        return self.samples / self.sample_rate_hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +176,13 @@ class CalibratedEstimator:
         force_n, force_std_n : float
             Of the contact; NaN where unknown.
         """
+        # the mode that lies in the band in air, or nearest to it
+        f = self.calibration.model.natural_rad_s / (2 * np.pi)
         low, high = record.frequency_hz[0], record.frequency_hz[-1]
-        air_hz = self._mode_in_air(low, high)
+        air_hz = float(f[np.argmin(np.maximum(0, np.maximum(low - f, f - high)))])
         prior = ContactPrior(self.law, self.tip_radius_m, air_hz, force_n, force_std_n)
         fit = _Fit(self.calibration, record, prior)
-        p, converged = fit.solved(prior.start)
-        return fit.result(p, converged)
-
-    def _mode_in_air(self, low_hz: float, high_hz: float) -> float:
-        """Natural frequency of the mode that lies in the band, or nearest to it [Hz]."""
-        f = self.calibration.model.natural_rad_s / (2 * np.pi)
-        away = np.maximum(0, np.maximum(low_hz - f, f - high_hz))
-        return float(f[np.argmin(away)])
+        return fit.result(*fit.solved(prior.start))
 
 
 class _Fit:
@@ -126,7 +218,7 @@ class _Fit:
         k = contact.at(np.broadcast_to(self._s, stacked))
         steady = sensor.response(self._s, k) * self._u
         poles = sensor.poles(contact)
-        if record.start is Start.UNKNOWN:
+        if not record.from_rest:
             return steady, poles
         residues = sensor.residues(poles, contact)
         gain, delay = (np.asarray(x)[..., None] for x in (sensor.gain, sensor.delay_s))
@@ -164,7 +256,7 @@ class _Fit:
         gap, poles = self.predicted(sensor, self.prior.stiffness(p))
         gap = (gap - self.record.y) / self._std
         real = np.concatenate([gap.real, gap.imag], axis=-1)
-        if self.record.start is Start.UNKNOWN:
+        if not self.record.from_rest:
             real = self._less_start(real, poles)
         deviations = self.prior.deviations(p)
         shape = (*real.shape[:-1], deviations.shape[-1])
@@ -175,8 +267,8 @@ class _Fit:
         low, high = self.record.frequency_hz[[0, -1]] * 2 * np.pi * np.array(_NEAR)
         out = np.empty_like(real)
         for index in np.ndindex(real.shape[:-1]):
-            all_of = poles[index] if poles.ndim > 1 else poles
-            near = all_of[(all_of.imag > 0) & (np.abs(all_of) > low) & (np.abs(all_of) < high)]
+            at, size = poles[index], np.abs(poles[index])
+            near = at[(at.imag > 0) & (size > low) & (size < high)]
             h, conjugate = self._decay(near), self._decay(near.conj())
             columns = np.concatenate([h + conjugate, 1j * (h - conjugate)])
             columns = np.concatenate([columns.real, columns.imag], axis=-1).T
@@ -184,10 +276,6 @@ class _Fit:
             out[index] = real[index] - q @ (q.T @ real[index])
             self.directions = q.shape[1]
         return out
-
-    def jacobian(self, p: FloatArray) -> FloatArray:
-        """(R, 4) of the residual by the parameters."""
-        return slope_of(self.residual, p)
 
     def solved(self, p: FloatArray) -> tuple[FloatArray, bool]:
         """Levenberg and Marquardt; the level of the noise from bins between lines where there are enough."""
@@ -205,7 +293,7 @@ class _Fit:
         residual, damping = self.residual(p), 1e-3
         cost = residual @ residual
         for _ in range(_STEPS):
-            jacobian = self.jacobian(p)
+            jacobian = slope_of(self.residual, p)
             normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
             while damping < 1e9:
                 step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
@@ -225,7 +313,7 @@ class _Fit:
 
     def result(self, p: FloatArray, converged: bool) -> TissueContact:
         """Covariances, pole, judgement."""
-        residual, jacobian = self.residual(p), self.jacobian(p)
+        residual, jacobian = self.residual(p), slope_of(self.residual, p)
         covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
         sensor = self.calibration.model
         std = self.calibration.std
@@ -236,11 +324,14 @@ class _Fit:
         stacked = np.tile(p, (free.size, 1))
         change = (self.residual(stacked, stack) - residual).T  # (R, free)
         by_sensor = -covariance @ jacobian.T @ change  # (4, free), per deviation
-        correlation = self.calibration.covariance[np.ix_(free, free)] / np.outer(
-            std[free], std[free]
-        )
+        scale = np.outer(std[free], std[free])
+        correlation = self.calibration.covariance[np.ix_(free, free)] / scale
         total = covariance + by_sensor @ correlation @ by_sensor.T
-        pole = self._pole(p)
+        # of the mode that is meant: nearest to that of the band in air, which tissue moves by a tenth
+        poles = sensor.poles(self.prior.stiffness(p))
+        poles = poles[poles.imag > 0]
+        away = np.abs(np.abs(poles) / (2 * np.pi) - self.prior.frequency_hz)
+        pole = poles[np.argmin(away)]
 
         def of_mode(q: FloatArray, of: SensorModel) -> FloatArray:
             """Pole and stiffness there, real and imaginary parts (..., 4)."""
@@ -259,9 +350,9 @@ class _Fit:
         with_sensor = noise + whole @ correlation @ whole.T
         squares = float(residual @ residual)
         dof = residual.size - p.size - self.directions
-        status, message = ContactStatus.OK, ""
+        status, of_poles, message = ContactStatus.OK, PolesStatus.OK, ""
         if special.chdtrc(dof, squares) < CONTRADICTED:
-            status = ContactStatus.CONTRADICTED
+            status, of_poles = ContactStatus.CONTRADICTED, PolesStatus.MODEL_ERROR
             worst = int(np.argmax(np.abs(residual[-3:])))
             message = (
                 f"residuals contradict the calibration: {squares:.0f}, {dof} expected (sensor changed, "
@@ -270,70 +361,99 @@ class _Fit:
             if abs(residual[-3 + worst]) > 4:
                 message += f"; {self.prior.expected[worst]} beyond what any tissue has"
         elif not converged:
-            status, message = ContactStatus.NOT_CONVERGED, f"not converged in {_STEPS} steps"
-        poles = self._poles(
-            p, value, noise[:2, :2], with_sensor[:2, :2], squares, dof, status, message
-        )
-        count = self._s.size
-        parts = residual[: 2 * count].reshape(2, count)
-        return TissueContact(
-            prior=self.prior,
-            parameters=p,
-            covariance=covariance,
-            total_covariance=total,
-            stiffness_n_per_m=complex(value[2], value[3]),
-            stiffness_covariance=noise[2:, 2:],
-            stiffness_total=with_sensor[2:, 2:],
-            poles=poles,
-            chi_square=squares,
-            degrees_of_freedom=dof,
-            noise_v_per_root_hz=self.noise,
-            residual=(parts[0] + 1j * parts[1]) / np.sqrt(2),
-            status=status,
-            message=message,
-        )
-
-    def _pole(self, p: FloatArray) -> complex:
-        """Pole of the mode that is meant: nearest to that of the band in air, which tissue moves by a tenth."""
-        poles = self.calibration.model.poles(self.prior.stiffness(p))
-        poles = poles[poles.imag > 0]
-        return complex(
-            poles[np.argmin(np.abs(np.abs(poles) / (2 * np.pi) - self.prior.frequency_hz))]
-        )
-
-    def _poles(
-        self,
-        p: FloatArray,
-        value: FloatArray,
-        noise: FloatArray,
-        total: FloatArray,
-        squares: float,
-        dof: int,
-        status: ContactStatus,
-        message: str,
-    ) -> Poles:
-        pole = np.array([complex(value[0], value[1])])
-        residue = self.calibration.model.residues(pole, self.prior.stiffness(p))
-        f0_hz, damping = natural_frequency_and_damping(pole)
-        turn = natural_frequency_and_damping_jacobian(pole)[0]
-        kinds = {
-            ContactStatus.OK: PolesStatus.OK,
-            ContactStatus.NOT_CONVERGED: PolesStatus.NOT_CONVERGED,
-        }
-        return Poles(
-            poles_rad_s=pole,
+            status, of_poles = ContactStatus.NOT_CONVERGED, PolesStatus.NOT_CONVERGED
+            message = f"not converged in {_STEPS} steps"
+        at = np.array([complex(value[0], value[1])])
+        f0_hz, damping = natural_frequency_and_damping(at)
+        turn = natural_frequency_and_damping_jacobian(at)[0]
+        found = Poles(
+            poles_rad_s=at,
             f0_hz=f0_hz,
             damping_ratio=damping,
-            residues=residue,
-            covariance=(turn @ noise @ turn.T)[None],
-            total_covariance=(turn @ total @ turn.T)[None],
-            pole_covariance=noise[None],
+            residues=sensor.residues(at, self.prior.stiffness(p)),
+            covariance=(turn @ noise[:2, :2] @ turn.T)[None],
+            total_covariance=(turn @ with_sensor[:2, :2] @ turn.T)[None],
+            pole_covariance=noise[None, :2, :2],
             band_hz=(float(self.record.frequency_hz[0]), float(self.record.frequency_hz[-1])),
             lines=int(np.count_nonzero(self._excited)),
             cost=squares,
             expected_cost=float(dof),
             variance_model="flat",
             method=f"calibrated sensor, {self.prior.law.value}",
-            status=kinds.get(status, PolesStatus.MODEL_ERROR),
+            status=of_poles,
             message=message,
         )
+        return TissueContact(
+            prior=self.prior,
+            parameters=p,
+            total_covariance=total,
+            stiffness_n_per_m=complex(value[2], value[3]),
+            stiffness_covariance=noise[2:, 2:],
+            stiffness_total=with_sensor[2:, 2:],
+            poles=found,
+            status=status,
+        )
+
+
+def calibrated_poles(
+    frf: FRF,
+    bands: Sequence[PoleBand],
+    estimator: CalibratedEstimator,
+    force_n: float = float("nan"),
+    force_std_n: float = 0.0,
+    method: str = "auto",
+) -> Poles:
+    """Poles in all bands, those of the first one through the calibrated sensor.
+
+    The records begin at rest. Where something stands against it the poles are those of `poles_of_bands`, and
+    the message says what.
+
+    Parameters
+    ----------
+    frf : FRF
+        With the bins of the bands.
+    bands : sequence of PoleBand
+        One or more.
+    estimator : CalibratedEstimator
+    force_n, force_std_n : float
+        Of the contact; NaN: unknown.
+    method : str
+        Of the black-box fit.
+    """
+    reason, found = _impossible(frf), None
+    if not reason:
+        assert frf.bins is not None  # see `_impossible`
+        try:
+            found = estimator(ContactRecord.of_bins(frf.bins), force_n, force_std_n)
+        except np.linalg.LinAlgError:  # its parameters ran away: no contact explains such a record
+            reason = "the fit through it does not converge: the data contradict the calibration"
+    if found is not None and abs(found.stiffness_n_per_m) < IN_AIR_N_PER_M:
+        # a pole in air is to show whether the sensor is as calibrated, so that it must not be taken from it
+        reason = "nothing is touched"
+    elif found is not None and found.status is ContactStatus.OK:
+        further = poles_of_bands(frf, bands, method).further if len(bands) > 1 else ()
+        return replace(found.poles, further=further)
+    elif found is not None:
+        reason = found.poles.message
+    poles = poles_of_bands(frf, bands, method)
+    note = f"without the calibrated sensor: {reason}"
+    return replace(poles, message="; ".join(filter(None, [poles.message, note])))
+
+
+def _impossible(frf: FRF) -> str:
+    """Why there can be no calibrated estimate; empty where there can."""
+    bins = frf.bins
+    if frf.status is FrfStatus.FAILED or bins is None:
+        return "the FRF brings no bins"
+    if bins.u.shape[0] > 1:
+        return f"{bins.u.shape[0]} realisations, of which one alone begins at rest"
+    if bins.harmonics.size < FEWEST_LINES:
+        return f"the band holds {bins.harmonics.size} excited lines, {FEWEST_LINES} are needed"
+    lines = frf.frequency_hz.size
+    held = sum(each.harmonics.size for each in (bins, *frf.further_bins))
+    if held < lines:
+        return f"{lines - held} excited lines lie outside of the bands"
+    if frf.further_bins:
+        return "lines of further bands are excited"
+    known = np.isfinite(bins.u).all() and np.isfinite(bins.y).all()
+    return "" if known else "bins are missing"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,27 +90,20 @@ def read_calibration(path: Path) -> CalibratedSensor:
     own = set(_File.__dataclass_fields__)
     file = read_dataclass(_File, {k: v for k, v in content.items() if k in own}, f"{path.name}:")
     about = {k: v for k, v in content.items() if k not in own and k != "format"}
-    nan = float("nan")
-    model = SensorModel(
-        *(np.asarray(getattr(file, name)) for name in PER_MODE),
-        *(np.asarray(getattr(file, name)) for name in SINGLE),
+    noise, mass_kg, mass_std_kg = (
+        math.nan if value is None else value
+        for value in (file.noise_v_per_root_hz, file.tip_mass_kg, file.tip_mass_std_kg)
     )
     calibration = Calibration(
-        model,
+        SensorModel(*(np.asarray(getattr(file, name)) for name in (*PER_MODE, *SINGLE))),
         file.covariance,
         np.array(file.determined),
         file.band_hz,
-        nan if file.noise_v_per_root_hz is None else file.noise_v_per_root_hz,
+        noise,
         file.excess,
         file.message,
     )
-    return CalibratedSensor(
-        calibration,
-        file.tip_radius_m,
-        nan if file.tip_mass_kg is None else file.tip_mass_kg,
-        nan if file.tip_mass_std_kg is None else file.tip_mass_std_kg,
-        about,
-    )
+    return CalibratedSensor(calibration, file.tip_radius_m, mass_kg, mass_std_kg, about)
 
 
 @dataclass(frozen=True, eq=False)

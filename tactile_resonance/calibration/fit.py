@@ -16,10 +16,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
-from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.calibration.model import PER_MODE, Calibration, SensorModel
-from tactile_resonance.calibration.start import one_above, start_channel, start_in_air, start_tip
+from tactile_resonance.calibration.records import (
+    CalibrationRecord,
+    Load,
+    one_above,
+    start_channel,
+    start_in_air,
+    start_tip,
+)
 from tactile_resonance.fields import require
 
 UNDETERMINED = 0.25
@@ -127,6 +133,8 @@ class _Records:
         self.free = np.ones(count, bool)
         self.free[3 * modes : 4 * modes] = free_tip
         self.free[4 * modes + 2] = free_gain
+        self._log = np.zeros(count, bool)
+        self._log[: 3 * modes] = self._log[4 * modes + 1] = self._log[4 * modes + 2] = True
         self.known = [r for r in self.records if r.load in (Load.MASS, Load.SPRING)]
         self._known_stds = np.array([max(r.value_std / r.value, 1e-9) for r in self.known])
         self._s = [record.s_rad_s for record in self.records]
@@ -138,26 +146,15 @@ class _Records:
     def start(self, sensor: SensorModel) -> FloatArray:
         """Internal values at which the fit begins."""
         n, x = self.modes, sensor.values.copy()
-        self.centre = self._internal(x)
         scale = np.abs(x[3 * n : 4 * n])
         self.limits[3 * n : 4 * n] = UNDETERMINED * np.where(scale > 0, scale, 1.0)
-        return np.concatenate([self.centre, np.zeros(len(self.known))])
-
-    def _logarithmic(self) -> BoolArray:
-        n = self.modes
-        log = np.zeros(4 * n + 4, bool)
-        log[: 3 * n] = log[4 * n + 1] = log[4 * n + 2] = True
-        return log
-
-    def _internal(self, values: FloatArray) -> FloatArray:
-        out, log = values.copy(), self._logarithmic()
-        out[log] = np.log(values[log])
-        return out
+        x[self._log] = np.log(x[self._log])
+        return np.concatenate([x, np.zeros(len(self.known))])
 
     def natural(self, x: FloatArray) -> FloatArray:
         """(4 n + 4,) parameters as `SensorModel` has them."""
-        out, log = x[: self.free.size].copy(), self._logarithmic()
-        out[log] = np.exp(out[log])
+        out = x[: self.free.size].copy()
+        out[self._log] = np.exp(out[self._log])
         return out
 
     def solved(self, start: FloatArray, steps: int = MOST_STEPS) -> _Solved:
@@ -192,7 +189,7 @@ class _Records:
         covariance = np.zeros((x.size, x.size))
         covariance[np.ix_(active, active)] = of_active
         values = self.natural(x)
-        slope = np.where(self._logarithmic(), values, 1.0)
+        slope = np.where(self._log, values, 1.0)
         covariance = covariance[: values.size, : values.size] * np.outer(slope, slope)
         return _Solved(values, covariance, self.residual(x))
 

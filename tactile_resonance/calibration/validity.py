@@ -15,8 +15,7 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.calibration.law import AIR
-from tactile_resonance.calibration.model import Calibration, SensorModel
+from tactile_resonance.calibration.model import AIR, Calibration, SensorModel
 from tactile_resonance.fields import require
 from tactile_resonance.poles.result import natural_frequency_and_damping
 
@@ -47,17 +46,13 @@ class Validity:
     state : SensorState
     shift, shift_std : float
         Common relative shift of the frequencies in air; NaN where unknown.
-    frequency_shifts, damping_changes : (m,) float
-        Of each mode that was measured: relative, and as they are.
     message : str
-        With the figures.
+        With the figures of each mode that was measured.
     """
 
     state: SensorState
     shift: float
     shift_std: float
-    frequency_shifts: FloatArray
-    damping_changes: FloatArray
     message: str
 
     @property
@@ -103,10 +98,9 @@ def check_in_air(
     measured = np.asarray(estimates, float).reshape(-1, 2)
     noise = np.asarray(covariances, float).reshape(-1, 2, 2)
     known = np.isfinite(measured).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))
-    nothing = np.empty(0)
     if not known.any():
         text = "no poles in air with a covariance"
-        return Validity(SensorState.UNKNOWN, np.nan, np.nan, nothing, nothing, text)
+        return Validity(SensorState.UNKNOWN, np.nan, np.nan, text)
     measured, noise = measured[known], noise[known]
     mode = np.argmin(np.abs(np.log(measured[:, :1] / expected[:, 0])), axis=1)
     at, covariance = expected[mode], own[mode] + noise
@@ -134,7 +128,7 @@ def check_in_air(
         state = SensorState.TEMPERATURE if mode.size > 1 else SensorState.SHIFTED
     else:
         state = SensorState.AS_CALIBRATED
-    return Validity(state, shift, shift_std, shifts, changes, f"{state.value} ({figures})")
+    return Validity(state, shift, shift_std, f"{state.value} ({figures})")
 
 
 def as_of_today(calibration: Calibration, found: Validity) -> Calibration:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
 from tactile_resonance.calibration.fit import Fitted, calibrate
 from tactile_resonance.calibration.model import Calibration
-from tactile_resonance.calibration.tip_mass import tip_mass
+from tactile_resonance.calibration.records import CalibrationRecord, Load
 from tactile_resonance.calibration.validity import check_in_air, poles_in_air
+from tactile_resonance.cantilever import tip_mass
 from tactile_resonance.fields import number, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.front import read_record
@@ -163,32 +163,17 @@ def _records(options: argparse.Namespace) -> list[CalibrationRecord]:
 def _simulated(seed: int) -> tuple[list[CalibrationRecord], np.ndarray, float]:
     """Records of a sensor that is a few percent off, its true parameters, its ball's radius [m]."""
     from tactile_resonance.sensor import read_sensor
-    from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-    from tactile_resonance.simulation.sensor.bench import SimulatedBench
-    from tactile_resonance.simulation.sensor.known_loads import (
+    from tactile_resonance.simulation.sensor.bench import BenchEffects, SimulatedBench
+    from tactile_resonance.simulation.sensor.experiments import (
         another_sensor,
-        records_of_calibration,
+        calibration_records,
         true_sensor,
     )
     from tactile_resonance.simulation.tissue.library import read_tissues
 
     bench = SimulatedBench(another_sensor(read_sensor(), seed), read_tissues().contact)
-    made, harmonics, rate_hz = records_of_calibration(
-        bench, masses_kg=[MASS_KG], effects=BenchEffects(channel_skew_s=SKEW_S), seed=seed
-    )
-    records = [
-        CalibrationRecord.of_samples(
-            u,
-            y,
-            sample_rate_hz=rate_hz,
-            harmonics=harmonics,
-            load=Load(kind),
-            value=value,
-            value_std=1e-3 * value,
-            name=kind,
-        )
-        for kind, value, u, y in made
-    ]
+    effects = BenchEffects(channel_skew_s=SKEW_S)
+    records = calibration_records(bench, masses_kg=[MASS_KG], effects=effects, seed=seed)
     return records, true_sensor(bench, SKEW_S).values, bench.sensor.tip.radius_m
 
 

@@ -25,8 +25,7 @@ from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.truth_topic import truth_to_response
 from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import BenchRun, SimulatedBench
+from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactSoFar
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene

@@ -20,8 +20,8 @@ from tactile_resonance.nodes.truth_topic import TruthTopic
 from tactile_resonance.record import Contact
 from tactile_resonance.simulation.plant.tabletop import LaidScene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactState, parts_of
-from tactile_resonance.simulation.sensor.response import INTERVAL_S
+from tactile_resonance.simulation.sensor.bimorph import parts_of
+from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactState
 from tactile_resonance.simulation.tissue.scene import PhantomScene
 from tactile_resonance.srv import ForceOver
 
@@ -128,7 +128,7 @@ class SimulatedTip:
         """The contact over an interval, as fine as the sensor follows it; unchanged where the plant ended."""
         assert self.plant is not None
         from_s, to_s = (ns * 1e-9 + self._plant_ahead_s for ns in (from_ns, to_ns))
-        parts = parts_of(to_s - from_s, INTERVAL_S)
+        parts = parts_of(to_s - from_s)
         try:
             return self.plant.contact_over(from_s, to_s, parts)
         except OSError:

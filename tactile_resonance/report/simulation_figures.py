@@ -13,20 +13,14 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.cantilever import mode_shape
 from tactile_resonance.report.drawing import SIMULATED, new_figure
 from tactile_resonance.simulation.plant.tip import SprungIndenter
-from tactile_resonance.simulation.sensor.beam import sensor_modes
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.changing_contact import (
-    ContactHistory,
-    Indentation,
-    indent,
-    pole_trajectory,
-)
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
+from tactile_resonance.simulation.sensor.changing_contact import BenchTip, pole_trajectory
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.indenter import Indenter
+from tactile_resonance.simulation.tissue.indenter import Indenter, indent
 from tactile_resonance.simulation.tissue.library import TissueLibrary
-from tactile_resonance.simulation.tissue.scene import PhantomScene
-from tactile_resonance.simulation.tissue.shapes import Sphere
+from tactile_resonance.simulation.tissue.scene import PhantomScene, Sphere
 
 
 def draw_tissues(bench: SimulatedBench, library: TissueLibrary, names: Sequence[str]) -> Figure:
@@ -74,12 +68,11 @@ def draw_indentation(bench: SimulatedBench, library: TissueLibrary, names: Seque
     cycle, relaxation, adhesion, sprung = figure.subplots(2, 2).ravel()
     for k, name in enumerate(names):
         tissue, colour = library[name], f"C{k}"
-        test = _cycle(bench, tissue, 0.0)
-        share = test.force_n / test.force_n.max()
-        cycle.plot(1e3 * test.depth_m, share, color=colour, label=tissue.label)
-        test = _relaxation(bench, tissue)
-        share = 100 * test.force_n / test.force_n.max()
-        relaxation.semilogx(test.time_s, share, color=colour, label=tissue.label)
+        depth, force = _cycle(bench, tissue, 0.0)
+        cycle.plot(1e3 * depth, force / force.max(), color=colour, label=tissue.label)
+        time, force = _relaxation(bench, tissue)
+        share = 100 * force / force.max()
+        relaxation.semilogx(time, share, color=colour, label=tissue.label)
         time, at_base, tip = _approach(bench, tissue)
         sprung.plot(time, 1e3 * at_base, color=colour, label=tissue.label)
         sprung.plot(time, 1e3 * tip, ":", color=colour)
@@ -95,8 +88,8 @@ def draw_indentation(bench: SimulatedBench, library: TissueLibrary, names: Seque
     )
     relaxation.axhline(40, color="grey", lw=0.7, ls=":")
     for work in (0.0, 0.01, 0.03):
-        test = _cycle(bench, library["gel10"], work)
-        adhesion.plot(1e3 * test.depth_m, 1e3 * test.force_n, label=f"{1e3 * work:g} mJ/m2")
+        depth, force = _cycle(bench, library["gel10"], work)
+        adhesion.plot(1e3 * depth, 1e3 * force, label=f"{1e3 * work:g} mJ/m2")
     adhesion.axhline(0, color="grey", lw=0.7)
     adhesion.set(
         xlabel="depth [mm]",
@@ -115,26 +108,24 @@ def draw_indentation(bench: SimulatedBench, library: TissueLibrary, names: Seque
     return figure
 
 
-def _cycle(bench: SimulatedBench, tissue: Tissue, work: float) -> Indentation:
-    """Twice 0.5 mm in and 0.2 mm above the surface, at 1 mm/s."""
+def _cycle(bench: SimulatedBench, tissue: Tissue, work: float) -> tuple[FloatArray, FloatArray]:
+    """Depth and force of going twice 0.5 mm in and 0.2 mm above the surface, at 1 mm/s."""
     turns = np.array([0.0, 5e-4, -2e-4, 5e-4, -2e-4])
     way = np.concatenate([[0.0], np.abs(np.diff(turns)).cumsum()])
     time = np.arange(0, way[-1] / 1e-3, 1e-3)
-    return _indent(bench, tissue, time, np.interp(1e-3 * time, way, turns), work)
+    depth = np.interp(1e-3 * time, way, turns)
+    return depth, indent(_ball(bench, tissue, work), time, depth)[0]
 
 
-def _relaxation(bench: SimulatedBench, tissue: Tissue) -> Indentation:
+def _relaxation(bench: SimulatedBench, tissue: Tissue) -> tuple[FloatArray, FloatArray]:
+    """Time and force of a ramp of 0.2 s and a hold."""
     time = np.concatenate([np.linspace(0, 0.2, 101), np.geomspace(0.201, 180, 300)])
-    return _indent(bench, tissue, time, 1e-3 * np.minimum(time / 0.2, 1), 0.0)
+    return time, indent(_ball(bench, tissue), time, 1e-3 * np.minimum(time / 0.2, 1))[0]
 
 
-def _indent(
-    bench: SimulatedBench, tissue: Tissue, time: FloatArray, depth: FloatArray, work: float
-) -> Indentation:
-    return indent(
+def _ball(bench: SimulatedBench, tissue: Tissue, work: float = 0.0) -> Indenter:
+    return Indenter(
         tissue,
-        time,
-        depth,
         tip_radius_m=bench.sensor.tip.radius_m,
         poisson_ratio=bench.contact.poisson_ratio,
         adhesion_j_per_m2=work,
@@ -142,11 +133,7 @@ def _indent(
 
 
 def _approach(bench: SimulatedBench, tissue: Tissue) -> tuple[FloatArray, FloatArray, FloatArray]:
-    ball = Indenter(
-        tissue,
-        tip_radius_m=bench.sensor.tip.radius_m,
-        poisson_ratio=bench.contact.poisson_ratio,
-    )
+    ball = _ball(bench, tissue)
     tip = SprungIndenter.on_beam(ball, sensor_modes(bench.sensor))
     time = np.arange(0, 0.6, 1e-3)
     rows = []
@@ -193,23 +180,27 @@ def draw_creep(bench: SimulatedBench, library: TissueLibrary, names: Sequence[st
     figure = new_figure(17, 5.5)
     figure.suptitle(f"A contact from 1 s on: force held (full), depth held (dotted) ({SIMULATED})")
     force_axes, radius_axes, pole_axes = figure.subplots(1, 3)
-    radius = bench.sensor.tip.radius_m
-    shown = np.linspace(0, 9, 40)
+    time = np.linspace(1, 10, 40)
     ramp = np.concatenate([np.linspace(0, 0.2, 101)[1:], np.linspace(0.21, 10, 980)])
     for k, name in enumerate(names):
         tissue, colour = library[name], f"C{k}"
-        held = ContactHistory.under_force(tissue, radius, bench.contact, duration_s=9.0)
-        depth = float(held.indentation_m[0])
-        still = ContactHistory.of_depth(
-            tissue, radius, bench.contact, ramp, depth * np.minimum(ramp / 0.2, 1), start_s=1.0
-        )
-        for history, style in ((held, "-"), (still, ":")):
-            f0 = np.abs(pole_trajectory(bench.sensor, history, shown)) / (2 * np.pi)
-            time = history.time_s + 1
+        held = [bench.coupled(tissue, hold_time_s=t) for t in time.tolist()]
+        assert held[0].contact is not None
+        depth_m = held[0].contact.indentation_m
+        pressed = indent(_ball(bench, tissue), ramp, depth_m * np.minimum(ramp / 0.2, 1))
+        still = [
+            BenchTip(tissue, force_n, 1.0, radius_m, depth_m).coupled(bench)
+            for force_n, radius_m in zip(*(np.interp(time, ramp, x) for x in pressed), strict=True)
+        ]
+        for sensors, style in ((held, "-"), (still, ":")):
+            contacts: list[Any] = [at.contact for at in sensors]
+            f0 = np.abs(pole_trajectory(sensors)) / (2 * np.pi)
             label = tissue.label if style == "-" else None
-            force_axes.plot(time, 1e3 * history.force_n, style, color=colour, label=label)
-            radius_axes.plot(time, 1e3 * history.contact_radius_m, style, color=colour)
-            pole_axes.plot(shown + 1, f0 - f0[0], style, color=colour)
+            force = [1e3 * contact.force_n for contact in contacts]
+            radius = [1e3 * contact.contact_radius_m for contact in contacts]
+            force_axes.plot(time, force, style, color=colour, label=label)
+            radius_axes.plot(time, radius, style, color=colour)
+            pole_axes.plot(time, f0 - f0[0], style, color=colour)
     force_axes.set(xlabel="time [s]", ylabel="force [mN]", title="force")
     radius_axes.set(xlabel="time [s]", ylabel="contact radius [mm]", title="contact radius")
     pole_axes.set(xlabel="time [s]", ylabel="change of f0 [Hz]", title="mode used")

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bench, its calibration from records, and one that is given."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from tactile_resonance.calibration.calibration_record import CalibrationRecord, Load
 from tactile_resonance.calibration.fit import Fitted, calibrate
 from tactile_resonance.calibration.model import Calibration, SensorModel
+from tactile_resonance.calibration.records import CalibrationRecord, Load
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.known_loads import (
+from tactile_resonance.simulation.sensor.bench import BenchEffects, SimulatedBench
+from tactile_resonance.simulation.sensor.experiments import (
     another_sensor,
-    records_of_calibration,
+    calibration_records,
     true_sensor,
 )
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 SKEW_S = 3e-6
-MASS_KG, MASS_STD_KG = 5e-5, 5e-8
+MASS_KG = 5e-5
 
 
 @pytest.fixture(scope="session")
@@ -35,23 +36,10 @@ def bench(library) -> SimulatedBench:
 @pytest.fixture(scope="session")
 def records(bench) -> list[CalibrationRecord]:
     effects = BenchEffects(channel_skew_s=SKEW_S)
-    made, harmonics, rate_hz = records_of_calibration(
+    made = calibration_records(
         bench, masses_kg=[MASS_KG], springs_n_per_m=[20.0], effects=effects, seed=4
     )
-    stds = {"mass": MASS_STD_KG, "spring": 0.1}
-    return [
-        CalibrationRecord.of_samples(
-            u,
-            y,
-            sample_rate_hz=rate_hz,
-            harmonics=harmonics,
-            load=Load(kind),
-            value=value,
-            value_std=stds.get(kind, 0.0),
-            name=kind,
-        )
-        for kind, value, u, y in made
-    ]
+    return [replace(of, value_std=0.1) if of.load is Load.SPRING else of for of in made]
 
 
 @pytest.fixture(scope="session")

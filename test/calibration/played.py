@@ -2,9 +2,8 @@
 """Records of a bench on a contact, from rest, as the calibrated estimator takes them."""
 
 from benchmarks.calibrate_benches import BAND_HZ, RATE_HZ, excitation
-from tactile_resonance.calibration.contact_record import ContactRecord, Start
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import BenchRun
+from tactile_resonance.calibration.estimator import ContactRecord
+from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
 from tactile_resonance.simulation.sensor.bimorph import couple
 
 SKEW_S = 3e-6
@@ -14,7 +13,7 @@ def played(bench, contact, duration_s=0.02, *, seed, periods=1, skew_s=0.0, sett
     """Record of a contact; after `settled` periods its state at the start is not known."""
     signal = excitation(duration_s)
     effects = BenchEffects(channel_skew_s=skew_s, **effects)
-    run = BenchRun(bench.sensor, couple(bench.sensor, contact), seed, effects, False)
+    run = BenchRun(bench.sensor, couple(bench.sensor, contact), seed, effects)
     if settled:
         run.block(signal, settled)
     block = run.block(signal, periods)
@@ -24,5 +23,5 @@ def played(bench, contact, duration_s=0.02, *, seed, periods=1, skew_s=0.0, sett
         sample_rate_hz=RATE_HZ,
         harmonics=signal.harmonics,
         band_hz=BAND_HZ,
-        start=Start.UNKNOWN if settled else Start.REST,
+        from_rest=not settled,
     )

@@ -11,8 +11,7 @@ import tactile_resonance as tr
 from benchmarks.calibrate_benches import BAND_HZ, excitation
 from tactile_resonance.calibration.file import CalibratedSensor
 from tactile_resonance.cli import main
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import BenchRun
+from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
 from tactile_resonance.simulation.sensor.bimorph import couple
 from tactile_resonance.simulation.tissue.hertz import hertz_contact
 

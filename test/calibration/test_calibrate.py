@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_resonance.calibration.calibration_record import Load
 from tactile_resonance.calibration.fit import calibrate
+from tactile_resonance.calibration.records import Load
 
 
 def of_loads(records, *loads):

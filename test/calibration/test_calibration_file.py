@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
-from tactile_resonance.calibration.tip_mass import tip_mass
+from tactile_resonance.cantilever import tip_mass
 from tactile_resonance.cli import main
 
 
@@ -105,7 +105,7 @@ def stored(path, u, y, harmonics, rate_hz):
 
 @pytest.fixture(scope="module")
 def files(bench, tmp_path_factory):
-    from tactile_resonance.simulation.sensor.known_loads import records_of_calibration
+    from tactile_resonance.simulation.sensor.experiments import records_of_calibration
 
     folder = tmp_path_factory.mktemp("records")
     made, harmonics, rate_hz = records_of_calibration(bench, masses_kg=[5e-5], seed=9)

@@ -8,18 +8,16 @@ import pytest
 from calibration.played import SKEW_S
 
 from benchmarks.calibrate_benches import BAND_HZ, excitation
-from tactile_resonance.calibration.estimator import CalibratedEstimator
-from tactile_resonance.calibration.frf_poles import calibrated_poles
+from tactile_resonance.calibration.estimator import CalibratedEstimator, calibrated_poles
 from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import BenchRun, SimulatedBench
+from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import couple
-from tactile_resonance.simulation.sensor.known_loads import another_sensor, true_sensor
+from tactile_resonance.simulation.sensor.experiments import another_sensor, true_sensor
 from tactile_resonance.simulation.tissue.hertz import hertz_contact
 
 BANDS = (PoleBand(*BAND_HZ, 2, 6),)

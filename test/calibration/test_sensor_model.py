@@ -4,9 +4,8 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.calibration.law import AIR, ContactStiffness
-from tactile_resonance.calibration.model import SensorModel, parameter_names
-from tactile_resonance.simulation.sensor.known_loads import true_sensor
+from tactile_resonance.calibration.model import AIR, ContactStiffness, SensorModel, parameter_names
+from tactile_resonance.simulation.sensor.experiments import true_sensor
 
 TISSUES = ("gel10", "gel16", "cortex", "liver", "tumour")
 

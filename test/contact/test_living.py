@@ -19,7 +19,7 @@ from tactile_resonance.contact.result import Cause
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Clinging, OnBone, RigidTip, Tip
-from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, stiffer

@@ -120,7 +120,7 @@ def test_a_scan_is_killed_and_resumed(domain, tmp_path):
     assert (tested.result.index, tested.test.protocol.value) == (1, "relaxation")
     assert tested.fit is not None, tested.reason
     value, std = tested.fit.modulus(1.0)
-    truth = read_tissues().gelatine(10.0).relaxation_modulus(1.0)
+    truth = read_tissues().gelatine(10.0).prony.relaxation_modulus(1.0)
     assert abs(np.log(value / truth)) < 4 * std
     assert (run_path / "mechanics.csv").read_text().count("\n") == 2
 

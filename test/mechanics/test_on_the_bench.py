@@ -31,7 +31,7 @@ def test_brain_and_liver_lose_most_of_the_force_and_gelatine_does_not(name, hold
     assert least < fit.relaxed_share < most
     for at in (1.0, 10.0):
         value, std = fit.modulus(at)
-        assert abs(np.log(value / tissue.relaxation_modulus(at))) < 4 * std
+        assert abs(np.log(value / tissue.prony.relaxation_modulus(at))) < 4 * std
 
 
 def test_the_command_reads_a_file_and_needs_to_know_what_holds_the_ball(tmp_path, capsys):
@@ -50,13 +50,13 @@ def test_the_command_reads_a_file_and_needs_to_know_what_holds_the_ball(tmp_path
     assert "not determined: slower than the hold" in printed
     (found,) = json.loads(out.read_text())
     value, std = found["modulus_pa"]["1"]
-    assert abs(np.log(value / tissue.relaxation_modulus(1.0))) < 4 * std
+    assert abs(np.log(value / tissue.prony.relaxation_modulus(1.0))) < 4 * std
     assert found["modulus_pa"]["60"] == [None, None]
     assert plot.stat().st_size > 20_000
     # the stage's way taken for the ball's: softer than it is, by much
     assert cli.main([*command, "--rigid", "--json", str(out)]) == 0
     (wrong,) = json.loads(out.read_text())
-    assert wrong["modulus_pa"]["1"][0] < 0.7 * tissue.relaxation_modulus(1.0)
+    assert wrong["modulus_pa"]["1"][0] < 0.7 * tissue.prony.relaxation_modulus(1.0)
     # what a run holds would be written anew: wrong options are refused before anything is read
     assert cli.main([*command, "--rigid", "--terms", "0"]) == 1
     assert capsys.readouterr().err.endswith("most_terms: got 0; accepted is 1 to 6\n")

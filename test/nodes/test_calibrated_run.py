@@ -31,7 +31,7 @@ from tactile_resonance.scan.recorded import EXCITATION, RECORD
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.known_loads import true_sensor
+from tactile_resonance.simulation.sensor.experiments import true_sensor
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 START_NS = 1_700_000_000_000_000_000

@@ -241,7 +241,7 @@ def test_a_calibrated_sensor_is_read_and_used(tmp_path, monkeypatch):
     from tactile_resonance.frf.measurement import MeasurementFrf
     from tactile_resonance.poles.structure import PoleBand
     from tactile_resonance.simulation.sensor.bench import SimulatedBench
-    from tactile_resonance.simulation.sensor.known_loads import true_sensor
+    from tactile_resonance.simulation.sensor.experiments import true_sensor
     from tactile_resonance.simulation.tissue.library import read_tissues
 
     bench, path = SimulatedBench.from_configuration(), tmp_path / "sensor.yaml"

@@ -13,8 +13,7 @@ from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.scan.measurement import design_measurement, excitation_of
 from tactile_resonance.scan.scene import read_scan_scene
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects
-from tactile_resonance.simulation.sensor.bench import BenchRun, SimulatedBench
+from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 TISSUES = ("gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver", "tumour")

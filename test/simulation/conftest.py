@@ -2,14 +2,14 @@
 """Fixtures of the simulation's tests."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from tactile_resonance.multisine import Excitation
 from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.linear import Lines
+from tactile_resonance.simulation.sensor.response import Lines
 from tactile_resonance.simulation.tissue.library import TissueLibrary, read_tissues
 
 
@@ -35,8 +35,8 @@ def silence() -> Callable[[float, int], Lines]:
 
 
 @pytest.fixture(scope="session")
-def multisine() -> Callable[..., SimpleNamespace]:
-    """Return a maker of flat random-phase multisines, seen only through their public fields."""
+def multisine() -> Callable[..., Excitation]:
+    """Return a maker of flat random-phase multisines."""
 
     def make(
         seed=0,
@@ -51,7 +51,7 @@ def multisine() -> Callable[..., SimpleNamespace]:
         harmonics = np.arange(1, samples_per_period // 2, step)
         inside = (harmonics * spacing >= band_hz[0]) & (harmonics * spacing <= band_hz[1])
         harmonics = harmonics[inside]
-        return SimpleNamespace(
+        return Excitation(
             harmonics=harmonics,
             amplitude_v=np.full(harmonics.size, level_v * np.sqrt(2 / harmonics.size)),
             phase_rad=np.random.default_rng(seed).uniform(0, 2 * np.pi, harmonics.size),

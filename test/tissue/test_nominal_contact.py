@@ -89,7 +89,7 @@ def test_poles_at_another_force_are_referred_to_the_truth_at_the_nominal_one(tis
 @pytest.mark.parametrize("tissue", ["gel10", "cortex", "liver"])
 def test_age_is_a_force_by_the_creep_compliance(tissue):
     """A contact of 4 s under 10 mN has the poles of one of 1 s under 10 mN x J(4 s) / J(1 s), exactly."""
-    compliance = TISSUES[tissue].creep_compliance
+    compliance = TISSUES[tissue].prony.creep_compliance
     grown = compliance(4.0) / compliance(AGE_S)
     power = np.log(grown) / np.log(4.0 / AGE_S)
     np.testing.assert_allclose(poles(tissue, age_s=4.0), poles(tissue, FORCE_N * grown), rtol=1e-9)
@@ -105,7 +105,7 @@ def test_age_is_a_force_by_the_creep_compliance(tissue):
 def test_a_force_that_relaxes_under_a_held_place_leaves_the_pole_where_it_is(age_s):
     """The contact stays, and so does the pole; the force alone would have it moved."""
     tissue = TISSUES["gel10"]
-    force_n = FORCE_N * float(tissue.relaxation_modulus(age_s) / tissue.relaxation_modulus(AGE_S))
+    force_n = FORCE_N * float(tissue.prony.relaxation_modulus(age_s) / tissue.prony.relaxation_modulus(AGE_S))
     x, contact = poles(), ContactLoad(force_n, 0.0, age_s)
     at = refer_to_nominal(x, np.zeros((2, 2)), contact, nominal(creep=0.03, creep_std=0.003))
     assert np.all(np.abs(at.compared - x) < np.sqrt(np.diag(at.covariance)))
@@ -114,7 +114,7 @@ def test_a_force_that_relaxes_under_a_held_place_leaves_the_pole_where_it_is(age
 
 
 def test_creep_of_the_scenes_is_that_of_the_bench():
-    compliance, told = TISSUES["gel10"].creep_compliance, DEMO.nominal_contact
+    compliance, told = TISSUES["gel10"].prony.creep_compliance, DEMO.nominal_contact
     for age_s in (0.5, 2.0, 4.0, 5.0):
         power = np.log(compliance(age_s) / compliance(AGE_S)) / np.log(age_s / AGE_S)
         assert abs(power - told.creep) < told.creep_std

@@ -28,7 +28,7 @@ from tactile_resonance.simulation.plant.plant import CellMounting, Plant
 from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import TissueLibrary
 from tactile_resonance.simulation.tissue.scene import PhantomScene

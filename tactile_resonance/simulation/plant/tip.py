@@ -13,7 +13,7 @@ import numpy as np
 
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
-from tactile_resonance.simulation.sensor.beam import BeamModes
+from tactile_resonance.simulation.sensor.bimorph import BeamModes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Ball, Indenter
 

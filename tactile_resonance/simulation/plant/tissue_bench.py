@@ -20,7 +20,7 @@ from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.surfaces import FlatSurface
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 
 START_M = 5e-3

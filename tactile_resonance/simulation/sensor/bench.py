@@ -12,22 +12,97 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.fields import require
+from tactile_resonance.fields import check_not_negative, require
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.sensor import SensorParameters, read_sensor
-from tactile_resonance.simulation.sensor.acquisition import BenchEffects, SignalParts, convert
-from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, couple
-from tactile_resonance.simulation.sensor.linear import Lines, PoleResidueModel
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, VaryingStream, couple
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
-from tactile_resonance.simulation.sensor.response import ResponseStream, VaryingStream, steady_state
+from tactile_resonance.simulation.sensor.response import (
+    Lines,
+    PoleResidueModel,
+    ResponseStream,
+    steady_state,
+)
 from tactile_resonance.simulation.tissue.hertz import HertzParameters, Tissue, hertz_contact
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 NEGLIGIBLE_COUNTS = 1e-3  # of the converter
 _SENSOR, _ACTUATOR, _HUM = range(3)  # independent random streams of a run
 
-Stream = ResponseStream | NonlinearStream | VaryingStream
+@dataclass(frozen=True)
+class BenchEffects:
+    """What spoils the signals, each with a switch (or a size, 0 = off) of its own.
+
+    Attributes
+    ----------
+    noise : bool
+        White noise on the sensor channel, of the sensor's parameters.
+    quantisation : bool
+        Converters that count, and saturate; otherwise samples are floating point volts.
+    nonlinearity : bool
+        The static nonlinearity of the sensor's parameters.
+    actuator_noise_v : float
+        Rms of white noise on the recorded actuator channel [V], in its full band.
+    channel_skew_s : float
+        Delay of the sensor channel behind the actuator channel [s]; negative: it leads.
+    hum_v, hum_frequency_hz : float
+        Rms [V] and frequency of mains hum on the sensor channel; its phase follows the seed.
+    offset_v, drift_v_per_s : float
+        Added to the sensor channel: ``offset + drift t``, t from the start of the run.
+    """
+
+    noise: bool = True
+    quantisation: bool = True
+    nonlinearity: bool = False
+    actuator_noise_v: float = 0.0
+    channel_skew_s: float = 0.0
+    hum_v: float = 0.0
+    hum_frequency_hz: float = 50.0
+    offset_v: float = 0.0
+    drift_v_per_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "actuator_noise_v", "hum_v", "hum_frequency_hz")
+        for name in ("channel_skew_s", "offset_v", "drift_v_per_s"):
+            value = getattr(self, name)
+            require(bool(np.isfinite(value)), name, value, "a finite number")
+
+    @classmethod
+    def none(cls) -> BenchEffects:
+        """Return the ideal bench: clean linear signals in floating point volts."""
+        return cls(noise=False, quantisation=False)
+
+
+DEFAULT_EFFECTS = BenchEffects()
+
+
+@dataclass(frozen=True, eq=False)
+class SignalParts:
+    """What a block is made of, (samples,) arrays in volts.
+
+    ``actuator = actuator_v + actuator_noise_v`` and
+    ``sensor = linear_v + distortion_v + disturbance_v + noise_v``, then quantised. `disturbance_v`
+    is hum, offset and drift.
+    """
+
+    actuator_v: FloatArray
+    actuator_noise_v: FloatArray
+    linear_v: FloatArray
+    distortion_v: FloatArray
+    disturbance_v: FloatArray
+    noise_v: FloatArray
+
+
+def convert(volts: FloatArray, scale_v: float, bits: int) -> Channel:
+    """Quantise volts to signed counts, clipped to the range of the converter.
+
+    Within range the error is at most half a count.
+    """
+    lowest, highest = -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+    counts = np.clip(np.rint(volts * (1 / scale_v)), lowest, highest).astype(np.int32)
+    saturated = bool(counts.size) and bool(counts.min() == lowest or counts.max() == highest)
+    return Channel(counts, scale_v, saturated=saturated)
 
 
 @dataclass(frozen=True)
@@ -77,36 +152,38 @@ class BenchRun:
     def __init__(
         self,
         sensor: SensorParameters,
-        coupled: CoupledBimorph,
-        seed: int,
-        effects: BenchEffects,
-        keep_parts: bool,
-        coupled_at: Callable[[float], CoupledBimorph] | None = None,
+        coupled: CoupledBimorph | Callable[[float], CoupledBimorph],
+        seed: int = 0,
+        effects: BenchEffects = DEFAULT_EFFECTS,
+        keep_parts: bool = False,
     ) -> None:
         good = isinstance(seed, (int, np.integer)) and seed >= 0
         require(good, "seed", seed, "an integer, 0 or above")
-        self.coupled = coupled
+        self._coupled_at = coupled if callable(coupled) else None
+        self.coupled = coupled(0.0) if callable(coupled) else coupled
         self.seed = seed
         self.effects = effects
-        self._coupled_at = coupled_at
         self._acquisition = sensor.acquisition
         self._keep_parts = keep_parts
         self.parts: SignalParts | None = None
-        skew = effects.channel_skew_s
+        skew, negligible_v = effects.channel_skew_s, self.negligible_v
         direct = PoleResidueModel(np.zeros(0, complex), np.zeros(0, complex), 1.0)
-        late_s = max(0.0, skew)
         self._drive = ResponseStream(direct, delay_s=max(0.0, -skew))
-        self._sensor: Stream
+        late_s, modal = max(0.0, skew), self.coupled.modal
+        self._sensor: ResponseStream | NonlinearStream | VaryingStream
         self._linear: ResponseStream | None = None  # beside a nonlinear one, where asked for
-        negligible_v = self.negligible_v
-        if coupled_at is not None:
-            self._sensor = VaryingStream(coupled_at, delay_s=late_s, negligible_v=negligible_v)
+        if self._coupled_at is not None:
+            off = not effects.nonlinearity
+            require(off, "nonlinearity", True, "off while the contact changes")
+            self._sensor = VaryingStream(
+                self._coupled_at, delay_s=late_s, negligible_v=negligible_v
+            )
         elif effects.nonlinearity:
-            self._sensor = NonlinearStream(coupled.modal, sensor.nonlinear, delay_s=late_s)
+            self._sensor = NonlinearStream(modal, sensor.nonlinear, delay_s=late_s)
             if keep_parts:
-                self._linear = ResponseStream(coupled.modal, delay_s=late_s)
+                self._linear = ResponseStream(modal, delay_s=late_s)
         else:
-            self._sensor = ResponseStream(coupled.modal, delay_s=late_s, negligible_v=negligible_v)
+            self._sensor = ResponseStream(modal, delay_s=late_s, negligible_v=negligible_v)
         self._lines: Lines | None = None
         self._realisation = -1
         self._index = 0
@@ -148,14 +225,17 @@ class BenchRun:
     def block(self, excitation: Excitation | Lines, periods: int = 1) -> Record:
         """Return the next periods of an excitation as one block; its origin's time counts from the start."""
         require(periods >= 1, "periods", periods, "1 or above")
-        lines = self._take_up(excitation)
+        lines = Lines.of(excitation)
+        if self._lines is None or not lines.same_signal(self._lines):
+            self._lines = lines
+            self._realisation += 1
+            self._index = 0
         index, start_s = self._index, self._samples / lines.sample_rate_hz
-        made = [self._make_period(lines) for _ in range(periods)]
+        kept: list[FloatArray] = []
+        made = [self._make_period(self._lines, kept) for _ in range(periods)]
         if self._keep_parts:
-            self.parts = SignalParts(
-                *map(np.concatenate, zip(*(kept for *_, kept in made), strict=True))
-            )
-        drive, sensed = (np.concatenate([period[k] for period in made]) for k in (0, 1))
+            self.parts = SignalParts(*np.concatenate(kept, axis=1))
+        drive, sensed = (np.concatenate(channel) for channel in zip(*made, strict=True))
         return Record(
             actuator=self._channel(drive, self._acquisition.actuator_scale_v),
             sensor=self._channel(sensed, self._acquisition.sensor_scale_v),
@@ -166,33 +246,16 @@ class BenchRun:
             origin=Origin(time_ns=round(1e9 * start_s), simulated=True),
         )
 
-    def play(
-        self,
-        excitation: Excitation | Lines,
-        periods: int,
-        *,
-        periods_per_block: int = 1,
-    ) -> Iterator[Record]:
-        """Yield the next periods of an excitation block by block; each is made when asked for."""
-        require(periods_per_block >= 1, "periods_per_block", periods_per_block, "1 or above")
-        whole = periods >= 1 and periods % periods_per_block == 0
-        require(whole, "periods", periods, f"a multiple of periods_per_block = {periods_per_block}")
+    def play(self, excitation: Excitation | Lines, periods: int) -> Iterator[Record]:
+        """Yield the next periods of an excitation, a block each, which is made when asked for."""
         lines = Lines.of(excitation)
-        for _ in range(periods // periods_per_block):
-            yield self.block(lines, periods_per_block)
-
-    def _take_up(self, excitation: Excitation | Lines) -> Lines:
-        lines = Lines.of(excitation)
-        if self._lines is None or not lines.same_signal(self._lines):
-            self._lines = lines
-            self._realisation += 1
-            self._index = 0
-        return self._lines
+        for _ in range(periods):
+            yield self.block(lines)
 
     def _make_period(
-        self, lines: Lines
-    ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...] | None]:
-        """Drive and sensor voltage over one period; where they are kept, the fields of `SignalParts`."""
+        self, lines: Lines, kept: list[FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Drive and sensor voltage over one period; where parts are kept, theirs (6, samples) too."""
         samples = lines.samples_per_period
         drive, clean = self._drive.play(lines), self._sensor.play(lines)
         linear = clean if self._linear is None else self._linear.play(lines)
@@ -202,14 +265,10 @@ class BenchRun:
         disturbance = self._disturbance(lines.sample_rate_hz, samples)
         self._index += 1
         self._samples += samples
-        kept = None
         if self._keep_parts:
-            added = (drive_noise, disturbance, noise)
-            first, second, third = (np.zeros(samples) if a is None else a for a in added)
-            kept = (drive, first, linear, clean - linear, second, third)
-        for part in (disturbance, noise):
-            clean = clean if part is None else clean + part
-        return drive if drive_noise is None else drive + drive_noise, clean, kept
+            parts = (drive, drive_noise, linear, clean - linear, disturbance, noise)
+            kept.append(np.stack([np.zeros(samples) if part is None else part for part in parts]))
+        return _sum(drive, drive_noise), _sum(clean, disturbance, noise)
 
     def _channel(self, volts: FloatArray, scale_v: float) -> Channel:
         if self.effects.quantisation:
@@ -234,7 +293,11 @@ class BenchRun:
         return np.asarray(hum + effects.offset_v + effects.drift_v_per_s * time_s)
 
 
-DEFAULT_EFFECTS = BenchEffects()
+def _sum(signal: FloatArray, *added: FloatArray | None) -> FloatArray:
+    """A signal and what is added to it; None adds nothing, and costs nothing."""
+    for part in added:
+        signal = signal if part is None else signal + part
+    return signal
 
 
 @dataclass(frozen=True)
@@ -308,7 +371,6 @@ class SimulatedBench:
         *,
         seed: int = 0,
         effects: BenchEffects = DEFAULT_EFFECTS,
-        keep_parts: bool = False,
     ) -> BenchRun:
         """Return a run whose linear sensor at each time [s] since its start is that of `coupled_at`.
 
@@ -319,5 +381,4 @@ class SimulatedBench:
         ValueError
             If the nonlinearity is asked for: it is not modelled on a changing contact.
         """
-        require(not effects.nonlinearity, "nonlinearity", True, "off while the contact changes")
-        return BenchRun(self.sensor, coupled_at(0.0), seed, effects, keep_parts, coupled_at)
+        return BenchRun(self.sensor, coupled_at, seed, effects)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bimorph sensor coupled to what it touches: exact poles, zeros, residues and response.
+"""The bimorph sensor coupled to what it touches: modes, exact poles, zeros, residues and response.
 
 Equations of motion (q modal coordinates, w tip deflection, v strain voltage, z_j Prony states):
 
@@ -9,22 +9,123 @@ Equations of motion (q modal coordinates, w tip deflection, v strain voltage, z_
 
 Actuator and sensor layer are collocated. Piezoelectric beam equations: Erturk & Inman,
 *Piezoelectric Energy Harvesting* (2011), ch. 3; here one layer drives and the other senses.
+
+Where the contact changes slowly, it is over an interval h that of the interval's middle, which takes over the
+state of the one before. With the contact at rest this is exact. Otherwise the part of the response that a
+pole p makes is off by at most ``|p'| h^2 / 12`` of itself, and on the mean over an interval by nothing: it
+lags behind its steady state by ``|p'| / Re(p)^2``, as it has to.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance._typing import ComplexArray, FloatArray
+from tactile_resonance.cantilever import cantilever_eigenvalues, tip_shape
 from tactile_resonance.fields import require
-from tactile_resonance.sensor import SensorParameters
-from tactile_resonance.simulation.sensor.beam import BeamModes, sensor_modes
-from tactile_resonance.simulation.sensor.linear import PoleResidueModel
+from tactile_resonance.sensor import BeamParameters, SensorParameters
+from tactile_resonance.simulation.sensor.response import Lines, PoleResidueModel, ResponseStream
 from tactile_resonance.simulation.tissue.hertz import HertzContact
+
+VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
+INTERVAL_S = 0.04
+"""Over which a contact that changes is held."""
+
+
+@dataclass(frozen=True)
+class BeamModes:
+    """Modal model of the beam with its tip (Euler-Bernoulli) in air, short-circuited electrodes.
+
+    Attributes
+    ----------
+    natural_rad_s : (n,) array
+        Undamped natural angular frequencies [rad/s], ascending.
+    damping_ratio : float
+        Modal damping ratio, the same for all modes.
+    tip_deflection : (n,) array
+        Mass-normalised mode shapes at the tip [kg^-1/2].
+    tip_slope : (n,) array
+        Their slopes at the tip [kg^-1/2 m^-1].
+    coupling : (n,) array
+        ``chi_i = theta * tip_slope_i`` [N kg^-1/2 / V]: modal force per volt.
+    capacitance_f : float
+        Total capacitance ``Ct = Cp + Cs`` across the sensing layer [F], Cp clamped.
+    eigenvalues : (n,) array
+        Roots beta of the frequency equation, ``natural = (beta / L)^2 sqrt(EI / m)``.
+    bending_stiffness_nm2 : float
+        EI [N m^2].
+    length_m : float
+        Free length [m].
+    """
+
+    natural_rad_s: FloatArray
+    damping_ratio: float
+    tip_deflection: FloatArray
+    tip_slope: FloatArray
+    coupling: FloatArray
+    capacitance_f: float
+    eigenvalues: FloatArray
+    bending_stiffness_nm2: float
+    length_m: float
+
+    @property
+    def static_stiffness_n_per_m(self) -> float:
+        """Stiffness of the whole beam at the tip, ``3 EI / L^3`` [N/m]."""
+        return 3 * self.bending_stiffness_nm2 / self.length_m**3
+
+
+def mass_per_length(beam: BeamParameters) -> float:
+    """Return the mass per unit length [kg/m]."""
+    piezo = 2 * beam.piezo_thickness_m * beam.piezo_density_kg_per_m3
+    return beam.width_m * (piezo + beam.shim_thickness_m * beam.shim_density_kg_per_m3)
+
+
+@lru_cache(maxsize=8)
+def sensor_modes(sensor: SensorParameters) -> BeamModes:
+    """Return the modal model of a sensor's beam; computed once, whatever the sensor touches.
+
+    With ``EI = b [2/3 Yp ((hs/2+hp)^3 - (hs/2)^3) + Ys hs^3/12]``, the clamped capacitance of one layer
+    ``Cp = (K33T eps0 - d31^2 Yp) b L / hp``, and the moment per volt of the driven one
+    ``theta = |d31| Yp b (hp + hs) / 2``.
+    """
+    beam, tip = sensor.beam, sensor.tip
+    length, line_mass = beam.free_length_m, mass_per_length(beam)
+    half = beam.shim_thickness_m / 2
+    piezo = 2 / 3 * beam.piezo_modulus_pa * ((half + beam.piezo_thickness_m) ** 3 - half**3)
+    shim = beam.shim_modulus_pa * beam.shim_thickness_m**3 / 12
+    stiffness = beam.width_m * (piezo + shim)
+    permittivity = beam.relative_permittivity_t33 * VACUUM_PERMITTIVITY
+    permittivity -= beam.d31_m_per_v**2 * beam.piezo_modulus_pa
+    require(
+        permittivity > 0,
+        "relative_permittivity_t33",
+        beam.relative_permittivity_t33,
+        "above d31^2 Y11 / eps0, below which the clamped capacitance is not positive",
+    )
+    clamped_f = permittivity * beam.width_m * length / beam.piezo_thickness_m
+    beta = cantilever_eigenvalues(tip.mass_kg / (line_mass * length), beam.mode_count)  # (n,)
+    deflection, slope = tip_shape(beta, line_mass * length, tip.mass_kg)  # (n,), (n,)
+    slope = slope / length
+    arm = (beam.piezo_thickness_m + beam.shim_thickness_m) / 2
+    moment = abs(beam.d31_m_per_v) * beam.piezo_modulus_pa * beam.width_m * arm
+    return BeamModes(
+        natural_rad_s=(beta / length) ** 2 * np.sqrt(stiffness / line_mass),
+        damping_ratio=beam.modal_damping_ratio,
+        tip_deflection=deflection,
+        tip_slope=slope,
+        coupling=moment * slope,
+        capacitance_f=clamped_f / (1 - sensor.electric.feedthrough),
+        eigenvalues=beta,
+        bending_stiffness_nm2=stiffness,
+        length_m=length,
+    )
 
 
 @dataclass(frozen=True)
@@ -127,12 +228,8 @@ class CoupledBimorph:
         after : CoupledBimorph
             The same sensor on a tissue of as many Prony terms.
         """
-        require(
-            after.poles_rad_s.size == self.poles_rad_s.size,
-            "after",
-            after.poles_rad_s.size,
-            f"a system of {self.poles_rad_s.size} states",
-        )
+        size, accepted = after.poles_rad_s.size, f"a system of {self.poles_rad_s.size} states"
+        require(size == self.poles_rad_s.size, "after", size, accepted)
         keep = self.poles_rad_s.imag >= 0
         x = (self._expansion[2][:, keep] @ (self.modal.weights * modal_state)).real
         if self.contact is not None and after.contact is not None:
@@ -208,3 +305,48 @@ def couple(sensor: SensorParameters, contact: HertzContact | None) -> CoupledBim
     return CoupledBimorph(
         sensor_modes(sensor), electric.input_resistance_ohm, electric.feedthrough, contact
     )
+
+
+def parts_of(length_s: float) -> int:
+    """Fewest equal parts of a length that are no longer than `INTERVAL_S`."""
+    return max(1, math.ceil(length_s / INTERVAL_S - 1e-9))
+
+
+class VaryingStream:
+    """Counterpart of `ResponseStream` for a sensor that is another at every time.
+
+    Parameters
+    ----------
+    coupled_at : callable
+        The linear sensor at a time [s] since the start.
+    delay_s, negligible_v : float
+        As in `ResponseStream`.
+    """
+
+    def __init__(
+        self,
+        coupled_at: Callable[[float], CoupledBimorph],
+        *,
+        delay_s: float = 0.0,
+        negligible_v: float = 0.0,
+    ) -> None:
+        self._coupled_at = coupled_at
+        self._coupled = coupled_at(0.0)
+        self._stream = ResponseStream(
+            self._coupled.modal, delay_s=delay_s, negligible_v=negligible_v
+        )
+        self._time = 0.0
+
+    def play(self, lines: Lines) -> FloatArray:
+        """Return the response to the next period of an excitation, as `ResponseStream.play`."""
+        samples, rate_hz = lines.samples_per_period, lines.sample_rate_hz
+        ends = np.linspace(0, samples, parts_of(samples / rate_hz) + 1).astype(int)
+        start, parts = self._time, []
+        for begin, end in pairwise(ends):
+            middle_s = start + float(begin + end) / 2 / rate_hz
+            contact = self._coupled_at(middle_s)
+            state = self._coupled.carry_state(self._stream.state, contact)
+            self._coupled, self._stream = contact, self._stream.continued(contact.modal, state)
+            parts.append(self._stream.play(lines, int(end - begin)))
+        self._time = start + samples / rate_hz
+        return np.concatenate(parts)

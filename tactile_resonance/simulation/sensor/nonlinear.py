@@ -10,7 +10,8 @@ the record starts from rest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import scipy.fft
@@ -18,8 +19,12 @@ import scipy.fft
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.sensor import NonlinearParameters
-from tactile_resonance.simulation.sensor.linear import Lines, PoleResidueModel, sample_period
-from tactile_resonance.simulation.sensor.response import ResponseStream
+from tactile_resonance.simulation.sensor.response import (
+    Lines,
+    PoleResidueModel,
+    ResponseStream,
+    sample_period,
+)
 
 
 class WindowKernel:
@@ -116,30 +121,11 @@ def _adams_weights(poles: ComplexArray, interval_s: float) -> ComplexArray:
 # product of the drive folds back into the band of the drive.
 OVERSAMPLING = 4
 WINDOW = 512  # fine samples per window: short, so that the iteration contracts fast
-TOLERANCE = 1e-13
+TOLERANCE, MOST_ITERATIONS = 1e-13, 100
 
 
 class DriveTooStrongError(ValueError):
     """No response of the nonlinear sensor to this drive was found; it may well have none."""
-
-
-@dataclass(frozen=True, eq=False)
-class NonlinearSteadyState:
-    """One period in steady state.
-
-    Attributes
-    ----------
-    sensor_v : (samples_per_period,) array
-        Sensor voltage Us [V].
-    strain_v : (samples_per_period,) array
-        Strain voltage s [V].
-    iterations : int
-        Fixed-point iterations needed.
-    """
-
-    sensor_v: FloatArray
-    strain_v: FloatArray
-    iterations: int
 
 
 def effective_drive(
@@ -160,10 +146,39 @@ def effective_drive(
     return Lines(np.arange(highest + 1), phasor, fine.sample_rate_hz, fine.samples_per_period)
 
 
-def strain_term(strain_v: FloatArray, nonlinear: NonlinearParameters) -> FloatArray:
-    """Return ``g2 s^2 + g3 s^3`` [V]."""
+def solve_strain(
+    known_v: FloatArray,
+    feedback: Callable[[FloatArray], FloatArray],
+    nonlinear: NonlinearParameters,
+    lines: Lines,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the strain ``s = known + feedback(g2 s^2 + g3 s^3)`` and that term [V], by Picard's iteration.
+
+    Raises
+    ------
+    DriveTooStrongError
+        If it does not converge: its loop gain, about ``3 g3 s^2 |S|`` at resonance, exceeds 1, as for a
+        narrow-band drive of 4 V rms.
+    """
     g2, g3 = nonlinear.strain_quadratic_per_v, nonlinear.strain_cubic_per_v2
-    return (g2 + g3 * strain_v) * strain_v * strain_v
+    strain, scale = known_v, float(np.abs(known_v).max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(MOST_ITERATIONS):
+            term = (g2 + g3 * strain) * strain * strain
+            following = known_v + feedback(term)
+            change = float(np.abs(following - strain).max())
+            strain = following
+            if change <= TOLERANCE * scale:
+                return strain, term
+            if not change < 1e3 * scale:
+                break
+    rms_v = np.linalg.norm(lines.phasor_v) / np.sqrt(2)
+    count, highest_hz = lines.harmonics.size, lines.frequency_hz[-1]
+    raise DriveTooStrongError(
+        f"amplitude_v: got {rms_v:.3g} V rms on {count} lines up to {highest_hz:g} Hz; accepted is a drive "
+        "weak enough for the sensor's nonlinearity (its response grows beyond bounds); lower the level or "
+        "spread it over more lines"
+    )
 
 
 def nonlinear_steady_state(
@@ -171,10 +186,9 @@ def nonlinear_steady_state(
     nonlinear: NonlinearParameters,
     lines: Lines,
     *,
-    max_iterations: int = 200,
     oversampling: int = OVERSAMPLING,
-) -> NonlinearSteadyState:
-    """Return one period of the nonlinear sensor in steady state.
+) -> FloatArray:
+    """Return one period of the nonlinear sensor's voltage Us [V] in steady state, (samples_per_period,).
 
     Parameters
     ----------
@@ -183,37 +197,26 @@ def nonlinear_steady_state(
     nonlinear : NonlinearParameters
     lines : Lines
         The drive.
-    max_iterations : int
     oversampling : int
         Products of the strain above half the fine sample rate fold back: 4 or more.
 
     Raises
     ------
     DriveTooStrongError
-        If the iteration does not converge: its loop gain, about ``3 g3 s^2 |S|`` at resonance,
-        exceeds 1, as for a narrow-band drive of 4 V rms.
+        As `solve_strain`.
     """
     drive = effective_drive(lines, nonlinear, oversampling)
     count = drive.samples_per_period
     frequency_hz = np.arange(count // 2 + 1) * (drive.sample_rate_hz / count)
     response = replace(model, direct=0.0).frequency_response(frequency_hz)
     response[-1] = 0.0  # half the sample rate has no phase
+
+    def feedback(term: FloatArray) -> FloatArray:
+        return np.asarray(scipy.fft.irfft(response * scipy.fft.rfft(term), count))
+
     linear = sample_period(drive, response[drive.harmonics])
-    strain = linear
-    scale = float(np.abs(linear).max())
-    with np.errstate(over="ignore", invalid="ignore"):
-        for iteration in range(1, max_iterations + 1):
-            feedback = response * scipy.fft.rfft(strain_term(strain, nonlinear))
-            following = linear + scipy.fft.irfft(feedback, count)
-            change = float(np.abs(following - strain).max())
-            strain = following
-            if change <= TOLERANCE * scale:
-                coarse = strain[::oversampling]
-                sensor = coarse + model.direct * sample_period(lines)
-                return NonlinearSteadyState(sensor, coarse, iteration)
-            if not change < 1e3 * scale:
-                break
-    raise DriveTooStrongError(_refusal(lines, f"no steady state in {iteration} iterations"))
+    strain, _ = solve_strain(linear, feedback, nonlinear, lines)
+    return strain[::oversampling] + model.direct * sample_period(lines)
 
 
 class NonlinearStream:
@@ -266,46 +269,19 @@ class NonlinearStream:
         if self._drive is None or not lines.same_signal(self._drive[0]):
             self._drive = (lines, effective_drive(lines, self._nonlinear, self._oversampling))
         driven = self._driven.play(self._drive[1])
-        strain = self._march(driven, lines.sample_rate_hz * self._oversampling, lines)
-        return strain[:: self._oversampling] + through
-
-    def _march(self, driven: FloatArray, rate_hz: float, lines: Lines) -> FloatArray:
-        """Add the feedback of the strain term to the driven strain, window by window."""
         strain = np.empty_like(driven)
         for begin in range(0, driven.size, WINDOW):
-            window = driven[begin : begin + WINDOW]
-            strain[begin : begin + WINDOW] = self._solve_window(window, rate_hz, lines)
-        return strain
+            window = slice(begin, begin + WINDOW)
+            strain[window] = self._solve_window(driven[window], lines)
+        return strain[:: self._oversampling] + through
 
-    def _solve_window(self, driven: FloatArray, rate_hz: float, lines: Lines) -> FloatArray:
-        kernel = self._kernel(driven.size, rate_hz)
-        known = driven + kernel.history(self._state, self._past)
-        strain = known
-        scale = float(np.abs(known).max())
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(100):
-                term = strain_term(strain, self._nonlinear)
-                following = known + kernel.convolve(term)
-                change = float(np.abs(following - strain).max())
-                strain = following
-                if change <= TOLERANCE * scale:
-                    self._state, self._past = kernel.advance(self._state, self._past, term)
-                    return strain
-                if not change < 1e3 * scale:
-                    break
-        raise DriveTooStrongError(_refusal(lines, "its response grows beyond bounds"))
-
-    def _kernel(self, size: int, rate_hz: float) -> WindowKernel:
-        key = (size, rate_hz)
+    def _solve_window(self, driven: FloatArray, lines: Lines) -> FloatArray:
+        """Add the feedback of the strain term to the driven strain, and move on."""
+        key = driven.size, lines.sample_rate_hz * self._oversampling
         if key not in self._kernels:
-            self._kernels[key] = WindowKernel(self._strain_model, size, 1 / rate_hz)
-        return self._kernels[key]
-
-
-def _refusal(lines: Lines, reason: str) -> str:
-    rms_v = np.linalg.norm(lines.phasor_v) / np.sqrt(2)
-    count, highest_hz = lines.harmonics.size, lines.frequency_hz[-1]
-    return (
-        f"amplitude_v: got {rms_v:.3g} V rms on {count} lines up to {highest_hz:g} Hz; accepted is a drive "
-        f"weak enough for the sensor's nonlinearity ({reason}); lower the level or spread it over more lines"
-    )
+            self._kernels[key] = WindowKernel(self._strain_model, key[0], 1 / key[1])
+        kernel = self._kernels[key]
+        known = driven + kernel.history(self._state, self._past)
+        strain, term = solve_strain(known, kernel.convolve, self._nonlinear, lines)
+        self._state, self._past = kernel.advance(self._state, self._past, term)
+        return strain

@@ -1,32 +1,153 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact time response of a linear system to a sequence of periodic excitations.
+"""Linear systems as sums over their poles, and their exact time response to periodic excitations.
+
+A system is ``G(s) = direct + sum r_k / (s - p_k)``: every state is one number that decays by itself, so any
+instant is reached without the instants before it. The polynomial form of the same system is useless in
+floating point at this order.
 
 Over a stretch of one excitation the response is its steady state, synthesised by an inverse FFT,
 plus free decays of the poles: ``z_k(t) = z_ss,k(t) + (z_k(0) - z_ss,k(0)) exp(p_k t)``. Nothing is
 discretised, so nothing warps, and a record can be produced period by period.
-
-Where the contact changes slowly, it is over an interval h that of the interval's middle, which takes over the
-state of the one before. With the contact at rest this is exact. Otherwise the part of the response that a
-pole p makes is off by at most ``|p'| h^2 / 12`` of itself, and on the mean over an interval by nothing: it
-lags behind its steady state by ``|p'| / Re(p)^2``, as it has to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
+import scipy.fft
+from numpy.typing import ArrayLike
 
-from tactile_resonance._typing import ComplexArray, FloatArray
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
-from tactile_resonance.simulation.sensor.linear import Lines, PoleResidueModel, sample_period
+from tactile_resonance.multisine import Excitation
 
 # A decay this far below the response is not computed: below the rounding of the sum it enters.
 NEGLIGIBLE = 1e-18
 MAX_DELAY_S = 1.0
+
+
+@dataclass(frozen=True)
+class PoleResidueModel:
+    """A real, stable, strictly diagonalisable single-input single-output system.
+
+    Attributes
+    ----------
+    poles_rad_s : (K,) array
+        Poles with imaginary part 0 or above [rad/s]; conjugates are implied.
+    residues_rad_s : (K,) array
+        Their residues [V/V rad/s].
+    direct : float
+        Direct term [V/V].
+
+    Notes
+    -----
+    State ``z_k' = p_k z_k + r_k u``; output ``direct u + sum weight_k Re z_k``, weight 2 for a
+    complex pole (it stands for the pair), 1 for a real one.
+    """
+
+    poles_rad_s: ComplexArray
+    residues_rad_s: ComplexArray
+    direct: float
+
+    @property
+    def weights(self) -> FloatArray:
+        """How often each listed pole counts, shape (K,): 2 for a complex pole, 1 for a real one."""
+        return np.where(self.poles_rad_s.imag > 0, 2.0, 1.0)
+
+    def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
+        """Return G(j 2 pi f), of the shape of `frequency_hz`."""
+        upper, lower = self.resolvents(frequency_hz)
+        weighted = self.residues_rad_s * self.weights / 2
+        return np.asarray(self.direct + upper @ weighted + lower @ np.conj(weighted))
+
+    def resolvents(self, frequency_hz: ArrayLike) -> tuple[ComplexArray, ComplexArray]:
+        """Return ``1 / (s - p)`` and ``1 / (s - conj p)`` at s = j 2 pi f, both (..., K)."""
+        s = 2j * np.pi * np.asarray(frequency_hz, dtype=float)[..., None]  # (..., 1)
+        return 1 / (s - self.poles_rad_s), 1 / (s - np.conj(self.poles_rad_s))
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """An excitation: harmonics (F,), ascending, complex peak amplitudes (F,) [V], and the sampling.
+
+    ``u(t) = Re sum_k phasor_v[k] exp(j 2 pi f_k t)``; the lines lie from 0 to below half the sample rate.
+    """
+
+    harmonics: IntArray
+    phasor_v: ComplexArray
+    sample_rate_hz: float
+    samples_per_period: int
+
+    @classmethod
+    def of(cls, excitation: Excitation | Lines) -> Lines:
+        """Lines of an excitation; what are lines already stays as it is."""
+        if isinstance(excitation, Lines):
+            return excitation
+        return cls(
+            excitation.harmonics,
+            excitation.amplitude_v * np.exp(1j * excitation.phase_rad),
+            excitation.sample_rate_hz,
+            excitation.samples_per_period,
+        )
+
+    @property
+    def period_s(self) -> float:
+        """Length of one period [s]."""
+        return self.samples_per_period / self.sample_rate_hz
+
+    @property
+    def frequency_hz(self) -> FloatArray:
+        """Frequencies of the lines [Hz], shape (F,)."""
+        return np.asarray(self.harmonics * (self.sample_rate_hz / self.samples_per_period), float)
+
+    def same_signal(self, other: Lines | None) -> bool:
+        """Whether another excitation is this one, sample for sample."""
+        if other is None or other is self:
+            return other is self
+        return (
+            self.sample_rate_hz == other.sample_rate_hz
+            and self.samples_per_period == other.samples_per_period
+            and np.array_equal(self.harmonics, other.harmonics)
+            and np.array_equal(self.phasor_v, other.phasor_v)
+        )
+
+    def resampled(self, factor: int) -> Lines:
+        """Return the same signal sampled `factor` times as fast."""
+        return Lines(
+            self.harmonics,
+            self.phasor_v,
+            self.sample_rate_hz * factor,
+            self.samples_per_period * factor,
+        )
+
+    def shifted(self, time_s: float) -> ComplexArray:
+        """Return the phasors of ``u(t + time_s)``, shape (F,)."""
+        return self.phasor_v * np.exp(2j * np.pi * self.frequency_hz * time_s)
+
+
+def sample_period(lines: Lines, gain: ArrayLike = 1.0, *, shift_s: float = 0.0) -> FloatArray:
+    """Return one period of ``Re sum gain_k phasor_k exp(j 2 pi f_k (t + shift))``, exactly.
+
+    Parameters
+    ----------
+    lines : Lines
+    gain : complex or (F,) array
+        Response at the lines [V/V].
+    shift_s : float
+        Time of the first sample [s].
+
+    Returns
+    -------
+    (samples_per_period,) array
+    """
+    count = lines.samples_per_period
+    spectrum = np.zeros(count // 2 + 1, dtype=complex)
+    phasor = lines.phasor_v if shift_s == 0.0 else lines.shifted(shift_s)
+    spectrum[lines.harmonics] = np.asarray(gain, complex) * phasor * (count / 2)
+    if lines.harmonics[0] == 0:
+        spectrum[0] *= 2
+    return np.asarray(scipy.fft.irfft(spectrum, count))
 
 
 def steady_state(model: PoleResidueModel, lines: Lines, time_s: float = 0.0) -> ComplexArray:
@@ -75,11 +196,24 @@ def free_decay(
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """What one excitation needs once: its steady-state period and the state at its time zero."""
+    """What one excitation needs once.
+
+    Attributes
+    ----------
+    lines : Lines
+    period : (samples_per_period,) array
+        Steady state, delayed by a part of an interval.
+    state : (K,) array
+        Of the poles at time zero of the excitation, in steady state.
+    late, part_s : int, float
+        The delay: output n is the response at ``(n - late) interval + part``.
+    """
 
     lines: Lines
-    period: FloatArray  # (samples_per_period,)
-    state: ComplexArray  # (K,)
+    period: FloatArray
+    state: ComplexArray
+    late: int
+    part_s: float
 
 
 class ResponseStream:
@@ -103,11 +237,10 @@ class ResponseStream:
         self, model: PoleResidueModel, *, delay_s: float = 0.0, negligible_v: float = 0.0
     ) -> None:
         require(bool(0 <= delay_s <= MAX_DELAY_S), "delay_s", delay_s, f"0 to {MAX_DELAY_S} s")
-        self._model = model
         require(negligible_v >= 0, "negligible_v", negligible_v, "0 or above")
+        self._model = model
         self._delay_s = delay_s
         self._negligible_v = negligible_v
-        self._sample_rate_hz: float | None = None
         self._plan: _Plan | None = None
         self._phase = 0  # samples of the current period already played
         # state minus steady state: it only decays, so it loses no digits over many periods
@@ -127,13 +260,11 @@ class ResponseStream:
     def continued(self, model: PoleResidueModel, state: ComplexArray) -> ResponseStream:
         """Return a stream of another model that goes on from here, in a given state (K,)."""
         other = ResponseStream(model, delay_s=self._delay_s, negligible_v=self._negligible_v)
-        other._sample_rate_hz, other._phase = self._sample_rate_hz, self._phase
-        other._late = self._late.copy()
+        other._phase, other._late = self._phase, self._late.copy()
         if self._plan is not None:
             lines = self._plan.lines
             other._plan = other._make_plan(lines)
-            now_s = self._phase / lines.sample_rate_hz
-            state = state - steady_state(model, lines, now_s)
+            state = state - steady_state(model, lines, self._phase / lines.sample_rate_hz)
         other._deviation = state
         return other
 
@@ -156,119 +287,38 @@ class ResponseStream:
         samples = lines.samples_per_period if samples is None else samples
         accepted = f"1 to samples_per_period = {lines.samples_per_period}"
         require(1 <= samples <= lines.samples_per_period, "samples", samples, accepted)
-        plan = self._take_up(lines)
+        plan, rate_hz = self._take_up(lines), lines.sample_rate_hz
         played = np.arange(self._phase, self._phase + samples)
-        steady = plan.period.take(played, mode="wrap")
         self._phase = (self._phase + samples) % lines.samples_per_period
-        scale = NEGLIGIBLE * float(np.abs(plan.state).max(initial=0.0))
-        return self._advance(steady, scale)
-
-    def skip(self, lines: Lines, periods: int) -> None:
-        """Advance whole periods of an excitation; only the last one is synthesised."""
-        require(periods >= 0, "periods", periods, "0 or above")
-        for _ in range(periods - 1):
-            self._take_up(lines)
-            self._deviation = self._deviation * self._decay(lines.samples_per_period)
-        if periods > 0:
-            self.play(lines)  # samples that are late belong to what follows
+        floor = max(NEGLIGIBLE * float(np.abs(plan.state).max(initial=0.0)), self._negligible_v)
+        response = plan.period.take(played, mode="wrap") + free_decay(
+            self._model, self._deviation, samples, 1 / rate_hz, plan.part_s, floor
+        )
+        self._deviation = self._deviation * np.exp(self._model.poles_rad_s * (samples / rate_hz))
+        if plan.late == 0:
+            return response
+        late = self._late if self._late.size else np.zeros(plan.late)
+        joined = np.concatenate([late, response])
+        self._late = joined[samples:]
+        return joined[:samples]
 
     def _take_up(self, lines: Lines) -> _Plan:
         """Return the plan of an excitation; a new one starts here, from the present state."""
-        self._set_rate(lines.sample_rate_hz)
         if self._plan is None or not lines.same_signal(self._plan.lines):
+            if self._plan is not None:
+                rate_hz = self._plan.lines.sample_rate_hz
+                accepted = f"{rate_hz:g}, that of what was played before"
+                require(lines.sample_rate_hz == rate_hz, "sample_rate_hz", lines.sample_rate_hz, accepted)
             state = self.state
             self._plan, self._phase = self._make_plan(lines), 0
             self._deviation = state - self._plan.state
         return self._plan
 
     def _make_plan(self, lines: Lines) -> _Plan:
-        _, part_s = self._delay_steps()
+        interval_s = 1 / lines.sample_rate_hz
+        # a delay of a whole number of intervals, up to rounding, is exactly that
+        late = int(np.ceil(self._delay_s / interval_s - 1e-9))
+        part_s = max(0.0, late * interval_s - self._delay_s)
         gain = self._model.frequency_response(lines.frequency_hz)
         period = sample_period(lines, gain, shift_s=part_s)
-        return _Plan(lines, period, steady_state(self._model, lines))
-
-    def _advance(self, steady: FloatArray, floor: float) -> FloatArray:
-        """Add the decay of the deviation to a steady response, move on, apply the delay."""
-        whole, part_s = self._delay_steps()
-        decay = free_decay(
-            self._model,
-            self._deviation,
-            steady.size,
-            self._interval_s,
-            part_s,
-            max(floor, self._negligible_v),
-        )
-        response = steady + decay
-        self._deviation = self._deviation * self._decay(steady.size)
-        if whole == 0:
-            return response
-        late = self._late if self._late.size else np.zeros(whole)
-        joined = np.concatenate([late, response])
-        self._late = joined[steady.size :]
-        return joined[: steady.size]
-
-    def _decay(self, samples: int) -> ComplexArray:
-        assert self._sample_rate_hz is not None
-        return np.asarray(np.exp(self._model.poles_rad_s * (samples / self._sample_rate_hz)))
-
-    @property
-    def _interval_s(self) -> float:
-        assert self._sample_rate_hz is not None
-        return 1 / self._sample_rate_hz
-
-    def _delay_steps(self) -> tuple[int, float]:
-        """Split the delay: output n is the response at ``(n - whole) interval + part``."""
-        # a delay of a whole number of intervals, up to rounding, is exactly that
-        whole = int(np.ceil(self._delay_s / self._interval_s - 1e-9))
-        return whole, max(0.0, whole * self._interval_s - self._delay_s)
-
-    def _set_rate(self, sample_rate_hz: float) -> None:
-        if self._sample_rate_hz is None:
-            self._sample_rate_hz = float(sample_rate_hz)
-        same = sample_rate_hz == self._sample_rate_hz
-        accepted = f"{self._sample_rate_hz:g}, that of what was played before"
-        require(same, "sample_rate_hz", sample_rate_hz, accepted)
-
-
-INTERVAL_S = 0.04
-
-
-class VaryingStream:
-    """Counterpart of `ResponseStream` for a sensor that is another at every time.
-
-    Parameters
-    ----------
-    coupled_at : callable
-        The linear sensor at a time [s] since the start.
-    delay_s, negligible_v : float
-        As in `ResponseStream`.
-    """
-
-    def __init__(
-        self,
-        coupled_at: Callable[[float], CoupledBimorph],
-        *,
-        delay_s: float = 0.0,
-        negligible_v: float = 0.0,
-    ) -> None:
-        self._coupled_at = coupled_at
-        self._coupled = coupled_at(0.0)
-        self._stream = ResponseStream(
-            self._coupled.modal, delay_s=delay_s, negligible_v=negligible_v
-        )
-        self._time = 0.0
-
-    def play(self, lines: Lines) -> FloatArray:
-        """Return the response to the next period of an excitation, as `ResponseStream.play`."""
-        samples, rate_hz = lines.samples_per_period, lines.sample_rate_hz
-        count = max(1, int(np.ceil(samples / rate_hz / INTERVAL_S - 1e-9)))
-        ends = np.linspace(0, samples, count + 1).astype(int)
-        start, parts = self._time, []
-        for begin, end in pairwise(ends):
-            middle_s = start + float(begin + end) / 2 / rate_hz
-            contact = self._coupled_at(middle_s)
-            state = self._coupled.carry_state(self._stream.state, contact)
-            self._coupled, self._stream = contact, self._stream.continued(contact.modal, state)
-            parts.append(self._stream.play(lines, int(end - begin)))
-        self._time = start + samples / rate_hz
-        return np.concatenate(parts)
+        return _Plan(lines, period, steady_state(self._model, lines), late, part_s)

@@ -8,6 +8,7 @@ energy away as from a disc on a half-space (cone model of Lysmer and Wolf, nu ->
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,29 +66,11 @@ class Tissue:
         left = np.exp(-1 / np.asarray(self.prony_times_s, dtype=float))
         return float(self.relaxation_modulus_1s_pa - self.prony_moduli_pa @ left)
 
-    @property
+    @cached_property
     def prony(self) -> Prony:
-        """The series itself."""
-        return Prony(
-            self.equilibrium_modulus_pa, self.prony_moduli_pa, np.array(self.prony_times_s)
-        )
-
-    @property
-    def instantaneous_modulus_pa(self) -> float:
-        """E(0) [Pa]."""
-        return self.prony.instantaneous_pa
-
-    def relaxation_modulus(self, time_s: ArrayLike) -> FloatArray:
-        """Return E(t) [Pa], of the shape of `time_s` (0 or above)."""
-        return self.prony.relaxation_modulus(time_s)
-
-    def complex_modulus(self, s_rad_s: ArrayLike) -> ComplexArray:
-        """Return E*(s) [Pa] at complex s [rad/s]."""
-        return self.prony.complex_modulus(s_rad_s)
-
-    def creep_compliance(self, time_s: ArrayLike) -> FloatArray:
-        """Return the creep compliance J(t) [1/Pa], of the shape of `time_s` (0 or above)."""
-        return self.prony.creep_compliance(time_s)
+        """The series itself, with its moduli and compliance."""
+        times_s = np.array(self.prony_times_s)
+        return Prony(self.equilibrium_modulus_pa, self.prony_moduli_pa, times_s)
 
 
 @dataclass(frozen=True)
@@ -142,7 +125,7 @@ class HertzContact:
         """Return ``k*(s)`` [N/m] at complex s [rad/s], of the shape of `s_rad_s`."""
         s = np.asarray(s_rad_s, dtype=complex)
         radiated = self.radiation_damping_ns_per_m * s + self.radiation_mass_kg * s**2
-        return np.asarray(self.stiffness_factor_m * self.tissue.complex_modulus(s) + radiated)
+        return np.asarray(self.stiffness_factor_m * self.tissue.prony.complex_modulus(s) + radiated)
 
 
 def hertz_contact(
@@ -178,7 +161,8 @@ def hertz_contact(
     require(0 < force < np.inf, "force_n", force, "a number above 0")
     require(0 < hold_time_s < np.inf, "hold_time_s", hold_time_s, "a number above 0")
     plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - parameters.poisson_ratio**2)
-    creep = tissue.creep_compliance(hold_time_s) / tissue.creep_compliance(1.0)
+    compliance = tissue.prony.creep_compliance
+    creep = compliance(hold_time_s) / compliance(1.0)
     radius = float((3 * force * tip_radius_m / (4 * plane_modulus) * creep) ** (1 / 3))
     return contact_of_radius(
         tissue, radius, parameters, force_n=float(force), indentation_m=radius**2 / tip_radius_m
@@ -202,7 +186,7 @@ def contact_of_radius(
     damping = mass = 0.0
     if parameters.radiation:
         reference_rad_s = 2 * np.pi * parameters.radiation_reference_hz
-        modulus = tissue.complex_modulus(1j * reference_rad_s)
+        modulus = tissue.prony.complex_modulus(1j * reference_rad_s)
         wave_speed = np.sqrt(np.abs(modulus) / (2 * (1 + nu) * density))
         damping = float(2 * density * wave_speed * np.pi * radius_m**2)
         mass = 1.257 * density * radius_m**3

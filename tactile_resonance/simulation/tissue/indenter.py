@@ -21,6 +21,7 @@ from operator import mul
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
@@ -146,7 +147,7 @@ class Indenter:
         self._scale = 2 / (1 - poisson_ratio**2)  # both halves of the row
         moduli, times = tissue.prony_moduli_pa, np.asarray(tissue.prony_times_s)
         moduli, times = moduli[moduli > 0], times[moduli > 0]
-        self._einf, self._e0 = tissue.equilibrium_modulus_pa, tissue.instantaneous_modulus_pa
+        self._einf, self._e0 = tissue.equilibrium_modulus_pa, tissue.prony.instantaneous_pa
         self._moduli, self._times = moduli.tolist(), times.tolist()
         # edge load / sqrt(x), as q (1 - nu^2)
         plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - poisson_ratio**2)
@@ -369,3 +370,36 @@ class Indenter:
                 stress = 0.0  # rounding of the profile when hardly anything touches
         self.force_n = self._scale * stress
         return self.force_n
+
+
+AT_ONCE_S = 1e-9  # in which the first depth is reached: glassy, as no Prony term is that fast
+
+
+def indent(
+    tip: Indenter, time_s: ArrayLike, depth_m: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Return force [N] and contact radius [m], (T,) each, of a tip moved in, held and drawn out.
+
+    Parameters
+    ----------
+    tip : Indenter
+        Not in contact before the first time, at which the first depth is put on at once.
+    time_s : (T,) array
+        Strictly ascending times [s].
+    depth_m : (T,) array
+        Depth of the lowest point below the undisturbed surface [m]; straight in between.
+
+    Raises
+    ------
+    ValueError
+        If times do not ascend, or shapes differ.
+    """
+    time, depth = np.asarray(time_s, dtype=float), np.asarray(depth_m, dtype=float)
+    shapes = time.ndim == 1 and time.size > 0 and depth.shape == time.shape
+    require(shapes, "depth_m", depth.shape, f"the shape of time_s, {time.shape}, one axis")
+    require(bool(np.all(np.diff(time) > 0)), "time_s", time, "strictly ascending times")
+    require(bool(np.all(np.isfinite(depth))), "depth_m", depth, "finite numbers")
+    steps = [AT_ONCE_S, *np.diff(time).tolist()]
+    moved = zip(depth.tolist(), steps, strict=True)
+    force_n, radius_m = np.array([(tip.step(x, dt), tip.contact_radius_m) for x, dt in moved]).T
+    return force_n, radius_m

@@ -27,7 +27,6 @@ from tactile_resonance.fields import (
     require,
 )
 from tactile_resonance.simulation.tissue.hertz import HertzParameters, Tissue
-from tactile_resonance.simulation.tissue.shapes import Point
 
 GELATINE_PERCENT_RANGE = (8.0, 20.0)  # how far the power law is trusted beyond the tabulated values
 
@@ -148,7 +147,7 @@ def uniform(tissue: Tissue) -> Material:
     return lambda position_m: tissue
 
 
-def gradient(start_m: Point, end_m: Point, tissue_between: Callable[[float], Tissue]) -> Material:
+def gradient(start_m: Vector, end_m: Vector, tissue_between: Callable[[float], Tissue]) -> Material:
     """Return a tissue that changes along the way from one point to another, constant beyond both.
 
     Parameters

@@ -9,14 +9,18 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tactile_resonance.sensor import NonlinearParameters
-from tactile_resonance.simulation.sensor.linear import Lines, PoleResidueModel, sample_period
 from tactile_resonance.simulation.sensor.nonlinear import (
     DriveTooStrongError,
     NonlinearStream,
     WindowKernel,
     nonlinear_steady_state,
 )
-from tactile_resonance.simulation.sensor.response import ResponseStream
+from tactile_resonance.simulation.sensor.response import (
+    Lines,
+    PoleResidueModel,
+    ResponseStream,
+    sample_period,
+)
 
 LINEAR = NonlinearParameters(0.0, 0.0)
 
@@ -33,7 +37,7 @@ def test_without_coefficients_it_is_the_linear_response(model, multisine, silenc
         np.testing.assert_allclose(found.play(lines), linear.play(lines), atol=1e-13)
     quiet = silence(50e3, 99)
     np.testing.assert_allclose(found.play(quiet), linear.play(quiet), atol=1e-13)
-    steady = nonlinear_steady_state(model, LINEAR, lines).sensor_v
+    steady = nonlinear_steady_state(model, LINEAR, lines)
     gain = model.frequency_response(lines.frequency_hz)
     np.testing.assert_allclose(steady, sample_period(lines, gain), atol=1e-13)
 
@@ -81,8 +85,8 @@ def test_march_settles_into_the_steady_state(model, sensor, multisine):
         record = stream.play(lines)
     steady = nonlinear_steady_state(model, sensor.nonlinear, lines)
     gain = model.frequency_response(lines.frequency_hz)
-    distortion = steady.sensor_v - sample_period(lines, gain)
-    difference = np.linalg.norm(record - steady.sensor_v) / np.linalg.norm(distortion)
+    distortion = steady - sample_period(lines, gain)
+    difference = np.linalg.norm(record - steady) / np.linalg.norm(distortion)
     assert difference < 1e-5
 
 
@@ -90,10 +94,10 @@ def test_steady_state_solves_its_equation(model, sensor, multisine):
     # odd and even products fall where they must, and the equation holds line by line
     lines = Lines.of(multisine(3, level_v=2.0, step=2))  # odd harmonics
     found = nonlinear_steady_state(model, sensor.nonlinear, lines)
-    spectrum = np.abs(np.fft.rfft(found.sensor_v))
+    spectrum = np.abs(np.fft.rfft(found))
     assert spectrum[0::2].max() < 1e-10 * spectrum.max()
     even = replace(sensor.nonlinear, actuator_quadratic_per_v=1e-2)
-    spectrum = np.abs(np.fft.rfft(nonlinear_steady_state(model, even, lines).sensor_v))
+    spectrum = np.abs(np.fft.rfft(nonlinear_steady_state(model, even, lines)))
     assert spectrum[2::2].max() > 1e-5 * spectrum.max()
 
 
@@ -103,7 +107,7 @@ def test_at_low_drive_superposition_holds_and_distortion_falls_with_the_square(
     relative = []
     for level in (0.1, 0.2):
         lines = Lines.of(multisine(4, level_v=level))
-        nonlinear = nonlinear_steady_state(model, sensor.nonlinear, lines).sensor_v
+        nonlinear = nonlinear_steady_state(model, sensor.nonlinear, lines)
         linear = sample_period(lines, model.frequency_response(lines.frequency_hz))
         relative.append(np.linalg.norm(nonlinear - linear) / np.linalg.norm(linear))
     assert relative[0] < 1e-4
@@ -115,7 +119,7 @@ def best_linear_approximation(model, sensor, multisine, level_v, realisations=6)
     responses = []
     for seed in range(realisations):
         lines = Lines.of(multisine(seed, level_v=level_v, samples_per_period=20_000))
-        output = nonlinear_steady_state(model, sensor.nonlinear, lines).sensor_v
+        output = nonlinear_steady_state(model, sensor.nonlinear, lines)
         drive = sample_period(lines)
         ratio = np.fft.rfft(output)[lines.harmonics] / np.fft.rfft(drive)[lines.harmonics]
         band = (lines.frequency_hz >= 200) & (lines.frequency_hz <= 300)

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time response: against the differential equation, the analytic response, and itself in pieces."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.integrate import simpson, solve_ivp
 from scipy.linalg import expm
 
-from tactile_resonance.simulation.sensor.linear import Lines, sample_period
-from tactile_resonance.simulation.sensor.response import ResponseStream, free_decay, steady_state
+from tactile_resonance.simulation.sensor.response import (
+    Lines,
+    ResponseStream,
+    free_decay,
+    sample_period,
+    steady_state,
+)
 
 
 @pytest.fixture(params=[None, "gel10", "cortex"], ids=str)
@@ -88,10 +91,10 @@ def test_change_of_excitation_and_ring_down_carry_the_state(coupled, multisine, 
 
 
 def test_steady_state_response_is_the_analytic_one(coupled, multisine):
-    lines = Lines.of(multisine(5))
+    lines = Lines.of(multisine(5, samples_per_period=100_000))
     stream = ResponseStream(coupled.modal)
-    stream.skip(lines, 20_000)  # 2000 s: longer than the slowest relaxation
-    record = stream.play(lines)
+    for _ in range(1000):  # 2000 s: longer than the slowest relaxation
+        record = stream.play(lines)
     spectrum = (
         np.fft.rfft(record)[lines.harmonics] / np.fft.rfft(sample_period(lines))[lines.harmonics]
     )
@@ -178,7 +181,8 @@ def test_what_has_decayed_costs_nothing_and_adds_nothing(bench, multisine):
     model = bench.coupled(None).modal
     lines = Lines.of(multisine(5))
     stream = ResponseStream(model)
-    stream.skip(lines, 1000)
+    for _ in range(1000):
+        stream.play(lines)
     np.testing.assert_array_equal(stream.play(lines), stream.play(lines))
 
 
@@ -210,31 +214,6 @@ def test_delay_shifts_the_response(coupled, multisine, quarters):
     found = np.concatenate([late.play(x) for x in (first, first, second)])
     expected = np.concatenate([np.zeros(quarters), dense])[: dense.size : 4]
     np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"harmonics": [3, 2]}, "harmonics"),
-        ({"harmonics": [1, 50]}, "harmonics"),
-        ({"harmonics": []}, "harmonics"),
-        ({"amplitude_v": [1.0]}, "phase_rad"),
-        ({"amplitude_v": [1.0, np.nan]}, "amplitude_v"),
-        ({"sample_rate_hz": 0.0}, "sample_rate_hz"),
-        ({"samples_per_period": 1}, "samples_per_period"),
-    ],
-)
-def test_bad_excitations_are_refused_by_name(change, named):
-    good = {
-        "harmonics": [1, 2],
-        "amplitude_v": [1.0, 1.0],
-        "phase_rad": [0.0, 0.0],
-        "sample_rate_hz": 100.0,
-        "samples_per_period": 100,
-    }
-    Lines.of(SimpleNamespace(**good))
-    with pytest.raises(ValueError, match=f"{named}.*accepted"):
-        Lines.of(SimpleNamespace(**(good | change)))
 
 
 def test_sample_rate_must_not_change(coupled, multisine):

@@ -7,7 +7,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 from tactile_resonance.simulation.plant.tip import SprungIndenter
-from tactile_resonance.simulation.sensor.beam import sensor_modes
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
 
@@ -85,7 +85,7 @@ def ting(tissue, peak, rise_s, times):
         same_radius = brentq(lambda s, t=t, d=down: weight(s, rise_s, t) - d, 0, rise_s, xtol=1e-14)
         # u = t'^(3/2) takes the place of time: d(depth^(3/2)) is uniform in it
         value = quad(
-            lambda u, t=t: float(tissue.relaxation_modulus(t - u ** (2 / 3))),
+            lambda u, t=t: float(tissue.prony.relaxation_modulus(t - u ** (2 / 3))),
             0, same_radius**1.5, limit=400, epsabs=0, epsrel=1e-10,
         )[0]  # fmt: skip
         scale = 4 * np.sqrt(RADIUS) / 3 / (1 - POISSON**2)
@@ -117,7 +117,7 @@ def row_of_springs(tissue, depth, dt, count=600):
         free, z_free = u, z
         for _ in range(3):
             z_free = decay * z + (1 - decay) * (free + u) / 2
-            free = (moduli * z_free).sum(axis=0) / tissue.instantaneous_modulus_pa
+            free = (moduli * z_free).sum(axis=0) / tissue.prony.instantaneous_pa
         held = d - x**2 / RADIUS
         z_held = decay * z + (1 - decay) * (held + u) / 2
         touching = held > free

@@ -10,8 +10,14 @@ from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
 from tactile_resonance.simulation.tissue.library import read_tissues, uniform
-from tactile_resonance.simulation.tissue.scene import PhantomScene, Region, read_scene
-from tactile_resonance.simulation.tissue.shapes import Box, HalfSpace, Sphere
+from tactile_resonance.simulation.tissue.scene import (
+    Box,
+    HalfSpace,
+    PhantomScene,
+    Region,
+    Sphere,
+    read_scene,
+)
 
 
 def write(tmp_path, content):
