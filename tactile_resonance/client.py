@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field, fields
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Point, Pose, PoseArray
+from rclpy.action.client import ClientGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
@@ -19,9 +23,21 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.msg import PointResult
-from tactile_resonance.nodes.goal_conduct import AskedGoal, Ending, GoalConduct
-from tactile_resonance.nodes.goals import GoalClient
-from tactile_resonance.nodes.running import RESULTS
+from tactile_resonance.nodes.goals import ASK_AGAIN_S, GoalClient, Steps, answer_to, offer
+from tactile_resonance.nodes.running import RESULTS, STEADY
+
+TICK_S = 0.1
+
+
+class Ending(Enum):
+    """How a scan or a calibration ended; a run that was begun and is not complete can be resumed."""
+
+    COMPLETE = "complete"  # every point of the plan is finished, the table is found
+    ENDED = "ended"  # some are not
+    CANCELLED = "cancelled"  # on request
+    REJECTED = "rejected"  # the goal was not accepted
+    REFUSED = "refused"  # it was, and no point could be begun, or the touches determine no table
+    LOST = "lost"  # scan_node went away
 
 
 @dataclass(frozen=True)
@@ -76,16 +92,70 @@ class CalibrationOutcome:
     file: str = ""
 
 
-_SCAN = {
-    Scan.Result.COMPLETE: Ending.COMPLETE,
-    Scan.Result.ENDED: Ending.ENDED,
-    Scan.Result.REFUSED: Ending.REFUSED,
-}
-_CALIBRATION = {
-    CalibrateTable.Result.DONE: Ending.COMPLETE,
-    CalibrateTable.Result.FAILED: Ending.ENDED,
-    CalibrateTable.Result.REFUSED: Ending.REFUSED,
-}
+_ENDINGS = (Ending.COMPLETE, Ending.ENDED, Ending.REFUSED)
+"""By the field ``outcome`` of either result."""
+
+
+@dataclass
+class AskedGoal:
+    """A goal that is under way.
+
+    Attributes
+    ----------
+    kind : type
+        Of its outcome, which has fields of the action's result.
+    wait_s : float
+        How long an active server is waited for [s].
+    on_feedback, on_point : callable, optional
+        Called with each feedback, with each finished attempt at a point.
+    future : Future
+        Its result is the outcome.
+    """
+
+    client: GoalClient
+    kind: type
+    goal: Any
+    wait_s: float
+    on_feedback: Callable[[Any], None] | None
+    on_point: Callable[[PointResult], None] | None = None
+    future: Future = field(default_factory=Future)
+    handle: ClientGoalHandle | None = None
+    cancelled: bool = False
+    cancelled_s: float = -math.inf  # when that was sent last
+    heard_s: float = -math.inf
+    heard: Any = None  # the newest feedback
+
+    def lost(self) -> Any:
+        """Outcome where the server went away."""
+        run = getattr(self.heard, "run_directory", "")
+        if not run:
+            return self.kind(Ending.LOST, "scan_node went away")
+        far = f"{self.heard.finished} of {self.heard.points} points were finished"
+        text = f"scan_node went away, {far}; the run can be resumed"
+        unknown = dict.fromkeys(("done", "failed", "skipped"))
+        return self.kind(Ending.LOST, text, run_directory=run, **unknown)
+
+    def outcome(self, answer: Any) -> Any:
+        """Outcome of the answer to the goal's result."""
+        result, ending = answer.result, _ENDINGS[answer.result.outcome]
+        if answer.status == GoalStatus.STATUS_CANCELED:
+            ending = Ending.CANCELLED
+        names = [f.name for f in fields(self.kind) if f.name != "ending"]
+        return self.kind(ending, **{name: getattr(result, name) for name in names})
+
+    def hear(self, message: Any) -> None:
+        """Take a feedback."""
+        self.heard_s = time.monotonic()
+        self.heard = message.feedback
+        if self.on_feedback is not None:
+            self.on_feedback(message.feedback)
+
+    def send_cancellation(self) -> None:
+        """Cancel it where it is accepted, once more where that may be lost."""
+        now_s = time.monotonic()
+        if self.cancelled and self.handle is not None and now_s - self.cancelled_s > ASK_AGAIN_S:
+            self.cancelled_s = now_s
+            self.handle.cancel_goal_async()
 
 
 class TactileClient:
@@ -116,7 +186,9 @@ class TactileClient:
         self._points = node.create_subscription(
             PointResult, f"{prefix}point_result", self._on_point, RESULTS, callback_group=group
         )
-        self._conduct = GoalConduct(node, group, partial(self._call, "rejection"))
+        self._timer = node.create_timer(TICK_S, self._on_tick, callback_group=group, clock=STEADY)
+        self._timer.cancel()
+        self._asked: AskedGoal | None = None
 
     def scan(
         self,
@@ -176,10 +248,7 @@ class TactileClient:
             seed=seed,
             notes=notes,
         )
-        client, kind = self._scans, ScanOutcome
-        return self._conduct.begin(
-            AskedGoal(client, kind, _SCAN, goal, wait_s, on_feedback, on_point)
-        )
+        return self._begin(AskedGoal(self._scans, ScanOutcome, goal, wait_s, on_feedback, on_point))
 
     def calibrate_table(
         self,
@@ -227,12 +296,15 @@ class TactileClient:
             sensor=sensor,
             file=str(file),
         )
-        client, kind = self._calibrations, CalibrationOutcome
-        return self._conduct.begin(AskedGoal(client, kind, _CALIBRATION, goal, wait_s, on_feedback))
+        return self._begin(
+            AskedGoal(self._calibrations, CalibrationOutcome, goal, wait_s, on_feedback)
+        )
 
     def cancel(self) -> None:
         """End the scan or calibration after drawing the tip back; its future is done when that is."""
-        self._conduct.cancel()
+        if self._asked is not None:
+            self._asked.cancelled = True
+            self._asked.send_cancellation()
 
     def pause(self) -> Future:
         """Wait with the tip free once the point under way is finished; as all below, a `Trigger.Response`."""
@@ -252,14 +324,71 @@ class TactileClient:
 
     def destroy(self) -> None:
         """Take everything off the node again; a scan under way goes on, and is followed no longer."""
-        self._conduct.destroy()
+        self._node.destroy_timer(self._timer)
         self._node.destroy_subscription(self._points)
         for service in self._services.values():
             self._node.destroy_client(service)
         self._scans.destroy()
         self._calibrations.destroy()
 
+    def _begin(self, asked: AskedGoal) -> Future:
+        if self._asked is not None:
+            raise RuntimeError(
+                "goal: one of this client is under way; cancel it or await its outcome"
+            )
+        self._asked, self._steps = asked, self._conduct(asked)
+        self._timer.reset()
+        return asked.future
+
     # in the executor
+
+    def _on_tick(self) -> None:
+        asked = self._asked
+        if asked is None:  # a timer may fire once more after it was cancelled
+            return
+        asked.send_cancellation()
+        try:
+            next(self._steps)
+        except StopIteration as ended:
+            self._timer.cancel()
+            self._asked = None
+            asked.future.set_result(ended.value)
+
+    def _conduct(self, asked: AskedGoal) -> Steps:
+        """From the goal to the outcome, one step with each tick."""
+        waited_for = "no scan_node is there"
+        deadline_s = time.monotonic() + asked.wait_s
+        while not asked.cancelled and time.monotonic() < deadline_s:
+            if not asked.client.server_is_ready():
+                yield
+                continue
+            # what was asked for may have begun: its answer is waited for even where it is wanted no more
+            wanted_s = time.monotonic()
+            with contextlib.closing(offer(asked.client, asked.goal, asked.hear)) as steps:
+                while time.monotonic() - wanted_s < ASK_AGAIN_S:
+                    try:
+                        next(steps)
+                    except StopIteration as answered:
+                        asked.handle = answered.value
+                        break
+                    yield
+                    if not asked.cancelled and time.monotonic() < deadline_s:
+                        wanted_s = time.monotonic()
+                else:
+                    break
+            if asked.handle is not None:
+                answer = yield from answer_to(asked.client, asked.handle, lambda: asked.heard_s)
+                return asked.lost() if answer is None else asked.outcome(answer)
+            why, refused_s = self._call("rejection"), time.monotonic()
+            while not why.done() and time.monotonic() - refused_s < ASK_AGAIN_S:
+                yield
+            if why.done() and why.result().success:
+                return asked.kind(Ending.REJECTED, why.result().message)
+            waited_for = "scan_node is not active"
+            yield
+        if asked.cancelled:
+            return asked.kind(Ending.CANCELLED, "cancelled before it was accepted")
+        return asked.kind(Ending.REJECTED, f"{waited_for}, for {asked.wait_s:g} s")
 
     def _call(self, name: str) -> Future:
         service = self._services[name]
@@ -270,7 +399,7 @@ class TactileClient:
         return answer
 
     def _on_point(self, message: PointResult) -> None:
-        asked = self._conduct.asked
+        asked = self._asked
         if asked is not None and asked.on_point is not None:
             asked.on_point(message)
 

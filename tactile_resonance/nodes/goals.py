@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goals of actions, asked for and followed from a thread of one's own while nodes come and go.
+"""Goals of actions, asked for and followed while nodes come and go; and answers of services.
 
 Every goal has an id that is chosen here, before anything is sent. So a goal whose answer is late, or lost, is
 sent again under the same id, and accepted once; and a goal that is given up can be cancelled whether its answer
 came or not. No goal goes on that is no longer followed.
+
+`offer` and `answer_to` are generators, to be asked for again and again while answers are received: they yield
+while they wait. `Goals` does so in a thread of one's own, `client.TactileClient` with a timer.
 """
 
 from __future__ import annotations
@@ -64,12 +67,17 @@ POLL_S = 0.005
 TAKEN_WITHIN_S = 60.0
 # An answer that has not come by then may be lost: the goal is sent again.
 ASK_AGAIN_S = 2.0
+# A goal without feedback for so long may have lost its node, or its result: that is requested again.
+SILENT_S = 5.0
+# A node that was not discovered for so long is gone.
+GONE_S = 10.0
 # A measurement that is cancelled ends with its block.
 GOAL_ENDS_WITHIN_S = 15.0
 REFUSED_AGAIN_S = 0.05
 
 Poll = Callable[[], None]
 """Called while waiting; raises where what is waited for cannot come."""
+Steps = Generator[None, None, Any]
 
 
 @dataclass(frozen=True)
@@ -108,67 +116,50 @@ class Goals:
         ScanEnded
             If no node accepts it.
         """
-        deadline = time.monotonic() + TAKEN_WITHIN_S
-        while time.monotonic() < deadline:
+        deadline_s = time.monotonic() + TAKEN_WITHIN_S
+        while time.monotonic() < deadline_s:
             check()
-            if not self.client.server_is_ready():
-                self.pause(REFUSED_AGAIN_S)
-                continue
-            handle = self._send(goal, check, poll, feedback, deadline)
-            if handle is not None:
-                return handle
-            refused()
+            if self.client.server_is_ready():
+                with contextlib.closing(offer(self.client, goal, feedback)) as steps:
+                    handle = self._wait(steps, lambda: self._require_node(check, poll), deadline_s)
+                if handle is not None:
+                    return handle
+                refused()
             self.pause(REFUSED_AGAIN_S)
         raise ScanEnded(f"{self.name}: no node takes the goal for {TAKEN_WITHIN_S:g} s")
 
     def follow(self, handle: ClientGoalHandle, check: Check, poll: Poll) -> Any:
         """Result of a goal; where anything is raised the goal is cancelled first, and its end waited for."""
-        future = handle.get_result_async()
+        steps = answer_to(self.client, handle)
         try:
-            while not future.done():
-                if not self.client.server_is_ready():
-                    raise NodeAway(f"{self.name}: its node went away", "node went away")
-                poll()
-                check()
-                self.pause(POLL_S)
-            if future.result().status == GoalStatus.STATUS_UNKNOWN:
+            answer = self._wait(steps, lambda: self._require_node(check, poll))
+            if answer is None:
                 raise NodeAway(f"{self.name}: its node does not know the goal", "node went away")
         except (PointFailed, Interrupted, ScanEnded):
             # a node that was restarted, or is gone, does not know the goal: its end is not waited for
-            cancelled = handle.cancel_goal_async()
-            if self._done(cancelled, ASK_AGAIN_S) and cancelled.result().goals_canceling:
-                self._done(future, GOAL_ENDS_WITHIN_S)
+            cancelled = _done(handle.cancel_goal_async())
+            answer = self._wait(cancelled, lambda: None, time.monotonic() + ASK_AGAIN_S)
+            if answer is not None and answer.goals_canceling:
+                self._wait(steps, lambda: None, time.monotonic() + GOAL_ENDS_WITHIN_S)
             raise
-        return future.result().result
+        return answer.result
 
-    def _send(
-        self,
-        goal: Any,
-        check: Check,
-        poll: Poll,
-        feedback: Callable[[Any], None] | None,
-        deadline: float,
-    ) -> ClientGoalHandle | None:
-        """Handle of a goal that was accepted; None where it was refused, or not answered in time."""
-        with contextlib.closing(offer(self.client, goal, feedback)) as waiting:
-            while time.monotonic() < deadline:
-                try:
-                    next(waiting)
-                except StopIteration as answered:
-                    return answered.value
-                if not self.client.server_is_ready():
-                    raise NodeAway(f"{self.name}: its node went away", "node went away")
-                poll()
-                check()
-                self.pause(POLL_S)
+    def _wait(self, steps: Steps, each: Callable[[], None], until_s: float = math.inf) -> Any:
+        """What a generator returns; None where it has not returned by then."""
+        while time.monotonic() < until_s:
+            try:
+                next(steps)
+            except StopIteration as ended:
+                return ended.value
+            each()
+            self.pause(POLL_S)
         return None
 
-    def _done(self, future: Future, timeout_s: float) -> bool:
-        """Wait for it; whether it came."""
-        deadline = time.monotonic() + timeout_s
-        while not future.done() and time.monotonic() < deadline:
-            self.pause(POLL_S)
-        return future.done()
+    def _require_node(self, check: Check, poll: Poll) -> None:
+        if not self.client.server_is_ready():
+            raise NodeAway(f"{self.name}: its node went away", "node went away")
+        poll()
+        check()
 
 
 def answer_of(
@@ -211,13 +202,10 @@ def answer_of(
     return None if answer is None else answer.result()
 
 
-def offer(
-    client: ActionClient, goal: Any, feedback: Callable[[Any], None] | None
-) -> Generator[None, None, ClientGoalHandle | None]:
+def offer(client: ActionClient, goal: Any, feedback: Callable[[Any], None] | None) -> Steps:
     """Offer a goal until it is answered; the handle of one that was accepted, None of one that was refused.
 
-    To be asked for again and again, while answers are received: it yields while it waits. One that is closed
-    before is given up: whatever accepts the goal later cancels it.
+    One that is closed before is given up: whatever accepts the goal later cancels it.
     """
     goal_id = UUID(uuid=list(uuid.uuid4().bytes))
     futures: list[Future] = []
@@ -247,6 +235,30 @@ def offer(
         raise
 
 
+def answer_to(
+    client: ActionClient, handle: ClientGoalHandle, heard_s: Callable[[], float] = lambda: -math.inf
+) -> Steps:
+    """Answer to the result of a goal; None where its node has gone or does not know it.
+
+    The result is requested again where neither it nor feedback, last at `heard_s`, has come for a while.
+    """
+    answers: list[Future] = []
+    asked_s, seen_s = -math.inf, time.monotonic()
+    while True:
+        now_s = time.monotonic()
+        if now_s - max(asked_s, heard_s()) > SILENT_S or not answers:
+            answers.append(handle.get_result_async())
+            asked_s = now_s
+        answer = next((each.result() for each in answers if each.done()), None)
+        if answer is not None:
+            return None if answer.status == GoalStatus.STATUS_UNKNOWN else answer
+        if client.server_is_ready():
+            seen_s = now_s
+        elif now_s - seen_s > GONE_S:
+            return None
+        yield
+
+
 def _known(refused: ClientGoalHandle) -> Generator[None, None, bool]:
     """Whether the node has a goal of this id after all."""
     result, asked_s = refused.get_result_async(), time.monotonic()
@@ -255,6 +267,13 @@ def _known(refused: ClientGoalHandle) -> Generator[None, None, bool]:
             return True  # it is under way
         yield
     return result.result().status != GoalStatus.STATUS_UNKNOWN
+
+
+def _done(future: Future) -> Steps:
+    """Result of a future."""
+    while not future.done():
+        yield
+    return future.result()
 
 
 def _drop(futures: list[Future]) -> None:

@@ -20,8 +20,9 @@ from rclpy.task import Future
 from tactile_resonance.action import Scan
 from tactile_resonance.msg import PointResult
 
+from tactile_resonance import client as client_module
 from tactile_resonance.client import CalibrationOutcome, Ending, ScanOutcome, TactileClient
-from tactile_resonance.nodes import goal_conduct, scan_node
+from tactile_resonance.nodes import goals, scan_node
 from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import POLES, initialised
 from tactile_resonance.nodes.scan_node import ScanNode
@@ -280,7 +281,7 @@ def test_a_node_that_is_not_active_is_waited_for(stack):
 
 
 def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
-    monkeypatch.setattr(goal_conduct, "GONE_S", 1.0)
+    monkeypatch.setattr(goals, "GONE_S", 1.0)
     stack.activate()
     heard = []
     future = stack.begin(heard, run_directory="named by the node")
@@ -299,7 +300,7 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
 
 @pytest.mark.parametrize("kind", [ScanOutcome, CalibrationOutcome])
 def test_a_goal_whose_node_goes_away_before_a_run_is_lost_without_one(kind):
-    asked = goal_conduct.AskedGoal(None, kind, {}, None, wait_s=1.0, on_feedback=None)
+    asked = client_module.AskedGoal(None, kind, None, wait_s=1.0, on_feedback=None)
     lost = asked.lost()
     assert (type(lost), lost.ending, lost.message) == (kind, Ending.LOST, "scan_node went away")
 

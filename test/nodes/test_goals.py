@@ -17,7 +17,6 @@ from tactile_resonance.action import Scan
 
 from tactile_resonance import client as client_module
 from tactile_resonance.client import Ending, TactileClient
-from tactile_resonance.nodes import goal_conduct
 from tactile_resonance.nodes import goals as goals_module
 from tactile_resonance.nodes.goals import ASK_AGAIN_S, GOAL_ENDS_WITHIN_S, TAKEN_WITHIN_S, Goals
 from tactile_resonance.scan.hands import Interrupted, NodeAway, PointFailed, ScanEnded
@@ -54,6 +53,7 @@ class Node:
         self.answers = answers
         self.result_of = lambda status: status
         self.ends_after_s = 0.0  # from a cancellation to the end of its goal
+        self.lost_results = self.lost_cancellations = 0  # so many of the first to come
         self.asked, self.running, self.cancelled = [], [], []
         self.results = {}
         self._due = []
@@ -108,6 +108,9 @@ class Node:
 
     def _cancel_goal_async(self, handle):
         goal_id = bytes(handle.goal_id.uuid)
+        if self.lost_cancellations:
+            self.lost_cancellations -= 1
+            return self._later(LOST, None)
         self.cancelled.append(goal_id)
         known = goal_id in self.running
         if known:
@@ -116,6 +119,9 @@ class Node:
 
     def _get_result_async(self, handle):
         goal_id = bytes(handle.goal_id.uuid)
+        if self.lost_results:
+            self.lost_results -= 1
+            return self._later(LOST, None)
         unknown = SimpleNamespace(status=GoalStatus.STATUS_UNKNOWN, result=None)
         return self.results.get(goal_id) or self._later(0.0, unknown)
 
@@ -173,6 +179,15 @@ def test_a_late_or_lost_answer_is_asked_for_under_the_same_id_and_the_goal_is_ta
     # it is the goal that is followed, whatever its second question was answered
     assert goals.follow(handle, nothing, nothing) == GoalStatus.STATUS_SUCCEEDED
     assert node.cancelled == []
+
+
+def test_a_result_that_is_lost_is_requested_again(taken):
+    node, goals = taken()
+    handle = goals.send("goal", nothing, nothing)
+    node.lost_results = 2
+    node.end(node.asked[0])
+    assert goals.follow(handle, nothing, nothing) == GoalStatus.STATUS_SUCCEEDED
+    assert node.now_s == pytest.approx(2 * goals_module.SILENT_S, abs=0.1)
 
 
 def test_a_goal_that_is_refused_is_asked_for_again_as_another(taken):
@@ -272,7 +287,7 @@ def scan(monkeypatch):
     def make(answers=None):
         node = Node(answers or {})
         node.result_of = lambda _: Scan.Result(outcome=Scan.Result.COMPLETE)
-        for module in (goal_conduct, goals_module):
+        for module in (client_module, goals_module):
             monkeypatch.setattr(module, "time", node)
         monkeypatch.setattr(client_module, "GoalClient", lambda *_, **__: node)
         client = TactileClient(MagicMock())
@@ -281,8 +296,8 @@ def scan(monkeypatch):
         def go_on(seconds):
             until_s = node.now_s + seconds
             while not future.done() and node.now_s < until_s:
-                client._conduct._on_tick()
-                node.pause(goal_conduct.TICK_S)
+                client._on_tick()
+                node.pause(client_module.TICK_S)
 
         return node, client, future, go_on
 
@@ -323,7 +338,7 @@ def test_a_scan_whose_node_was_started_anew_is_lost(scan):
     go_on(60.0)
     assert not future.done()
     node.results.clear()
-    go_on(goal_conduct.SILENT_S + 1.0)
+    go_on(goals_module.SILENT_S + 1.0)
     assert future.result().ending is Ending.LOST
 
 
@@ -336,3 +351,15 @@ def test_a_scan_that_is_cancelled_before_its_answer_came_does_not_go_on(scan, an
     node.pause(10.0)  # what is late comes now
     assert node.running == []
     assert future.result().ending is Ending.CANCELLED
+
+
+def test_a_cancellation_that_is_lost_is_sent_again_while_feedback_comes(scan):
+    node, client, future, go_on = scan()
+    go_on(1.0)
+    node.lost_cancellations = 2
+    client.cancel()
+    while not future.done() and node.now_s < 30.0:
+        client._asked.hear(SimpleNamespace(feedback=None))
+        go_on(1.0)
+    assert future.result().ending is Ending.CANCELLED
+    assert node.cancelled == node.asked
