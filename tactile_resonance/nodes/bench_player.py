@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated bench plays an excitation, each block as its last sample is taken; and the time it has."""
+"""What the simulated bench runs on: its robot as a process, or its time alone; and who plays excitations."""
 
 from __future__ import annotations
 
 import contextlib
+import select
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from rosgraph_msgs.msg import Clock
 
@@ -15,13 +20,98 @@ from tactile_resonance.clock import ClockLostError, SimulatedClock, time_address
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
+from tactile_resonance.processes import end_with_parent, may_take_priority
 from tactile_resonance.record import Origin, Record
 from tactile_resonance.simulation.plant.bench_time import BenchTime
+from tactile_resonance.simulation.plant.defaults import PRIORITY, READY
+from tactile_resonance.simulation.plant.simulated_robot import order
 from tactile_resonance.simulation.ur5e.reactor import Reactor
 
+START_WITHIN_S = 90.0
+ANSWER_WITHIN_S = 10.0
+END_WITHIN_S = 3.0
 STEP_NS = 2_000_000
 CLOCK_S = 0.04
 """Between two messages on `/clock`, by the machine's clock."""
+
+
+class PlantChild:
+    """Starts `tactile_resonance simulate-ur`, with tissue and load cell, as a process that ends with its owner.
+
+    Parameters
+    ----------
+    host : str
+        Address of the robot, 127.x.y.z.
+    scene : Path
+    table_in_base : six numbers
+    seed : int
+    simulated_time : bool
+        Its time goes on as those who take part in it let it; else that of the wall clock.
+
+    Raises
+    ------
+    ValueError
+        If it does not come up; with what it printed.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        scene: Path,
+        table_in_base: Sequence[float],
+        seed: int,
+        simulated_time: bool,
+    ) -> None:
+        self._host = host
+        pace = ["--priority", str(PRIORITY if may_take_priority(PRIORITY) else 0)]
+        self._process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
+                *("--scene", str(scene), "--seed", str(seed % 2**31), "--table"),
+                *(str(float(value)) for value in table_in_base),
+                *(["--simulated-time"] if simulated_time else pace),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+            preexec_fn=end_with_parent if sys.platform == "linux" else None,
+        )
+        assert self._process.stdout is not None
+        deadline = time.monotonic() + START_WITHIN_S
+        said = []
+        while time.monotonic() < deadline:
+            ready, _, _ = select.select([self._process.stdout], [], [], 0.1)
+            line = self._process.stdout.readline() if ready else ""
+            if line.startswith(READY):
+                return
+            if line.strip():
+                said.append(line.strip())
+            elif self._process.poll() is not None:
+                break
+        self.close()
+        raise ValueError(
+            f"robot_host: no simulated robot at {host}: {' '.join(said) or 'no output'}"
+        )
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    def ask(self, what: str, **arguments: object) -> dict[str, Any]:
+        """Answer of its control port; ``OSError`` where none comes."""
+        return order(self._host, what, timeout_s=ANSWER_WITHIN_S, **arguments)
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.terminate()
+        try:
+            self._process.wait(END_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
 
 class BenchServer:

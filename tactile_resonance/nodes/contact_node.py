@@ -26,9 +26,8 @@ from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
-from tactile_resonance.nodes.goal_thread import in_thread
 from tactile_resonance.nodes.indent_conduct import IndentConduct
-from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode, in_thread
 from tactile_resonance.nodes.messages import (
     contact_feedback,
     contact_goal,

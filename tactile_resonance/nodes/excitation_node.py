@@ -21,8 +21,7 @@ from tactile_resonance.drivers.acquisition import (
 )
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import contact_source, devices, excitation_design
-from tactile_resonance.nodes.goal_thread import in_thread
-from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread
 from tactile_resonance.nodes.messages import excitation_to_message, record_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS, run_node

@@ -8,21 +8,24 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import ClockLostError
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchServer, bench_record
+from tactile_resonance.nodes.bench_player import (
+    BenchNow,
+    BenchPlayer,
+    BenchServer,
+    PlantChild,
+    bench_record,
+)
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
 from tactile_resonance.nodes.parameters import Parameter, file_of, values
-from tactile_resonance.nodes.plant_child import PlantChild
 from tactile_resonance.nodes.running import RESULTS, run_node
-from tactile_resonance.nodes.simulated_tip import SimulatedTip
+from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_to_response
 from tactile_resonance.nodes.stop_input import StopInput
-from tactile_resonance.nodes.truth_topic import truth_to_response
 from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
@@ -114,7 +117,7 @@ class FakeHardwareNode(ManagedNode):
         self._touch = SimulatedTip(self, self._bench, read, plant, self._now_ns, self._stop)
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
         self.serve(Play, "bench/play", self._on_play)
-        self.serve(Trigger, "bench/stop", self._on_stop)
+        self.serve_trigger("bench/stop", self._silence)
         self.serve(Truth, "bench/get_truth", self._on_truth)
         self._said_lines = 0
 
@@ -127,22 +130,21 @@ class FakeHardwareNode(ManagedNode):
         """Silence the output."""
         self._silence()
 
-    def _silence(self) -> None:
+    def _silence(self) -> str:
         self._player.silence()
         self._played = None
+        return ""
 
     def _draw_back(self) -> None:
         if self._touch is not None:
             self._touch.draw_back()
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
-        if not self.active:
-            response.message = f"fake_hardware_node is {self.state_name()}"
-            return response
-        asked_id = request.excitation.excitation_id
-        if self._played is not None and self._played[0] == asked_id != 0:
-            return self._played[1]  # asked again: the answer was lost, or late
         try:
+            self.require_active()
+            asked_id = request.excitation.excitation_id
+            if self._played is not None and self._played[0] == asked_id != 0:
+                return self._played[1]  # asked again: the answer was lost, or late
             excitation = excitation_from_message(request.excitation)
             effects = BenchEffects(**dict(zip(EFFECTS, values(self, *EFFECTS), strict=True)))
             (seed,) = values(self, "seed")
@@ -173,11 +175,9 @@ class FakeHardwareNode(ManagedNode):
             self.get_logger().info(str(effort))
 
     def _on_truth(self, request: Truth.Request, response: Truth.Response) -> Truth.Response:
-        if not self.active:
-            response.message = f"fake_hardware_node is {self.state_name()}"
-            return response
         place = request.position
         try:
+            self.require_active()
             if request.here:
                 self._touch.take_up()
             tip = self._touch.tip if request.here else self._touch.at((place.x, place.y, place.z))
@@ -190,11 +190,6 @@ class FakeHardwareNode(ManagedNode):
             truth_to_response(coupled, request.frequency_hz, response)
         except (ValueError, ClockLostError) as error:
             response.message = str(error)
-        return response
-
-    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._silence()
-        response.success = True
         return response
 
     def _start(
@@ -231,7 +226,7 @@ class FakeHardwareNode(ManagedNode):
             if so_far is not None:
                 so_far.extend(excitation.period_s, touch.contact_over(end_ns - block_ns, end_ns))
                 pose.header.stamp = time_message((start_ns + end_ns) // 2)
-                touch.truth.publish(pose, tip, excitation.measurement_id, so_far.parts)
+                touch.tell_truth(pose, tip, excitation.measurement_id, so_far.parts)
             record = bench_record(next(blocks), excitation, start_ns, self._frame_id)
             self._blocks.publish(record_to_message(record))
 

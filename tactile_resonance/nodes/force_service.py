@@ -14,7 +14,7 @@ from tactile_resonance.contact.force_over import ForceRecord
 from tactile_resonance.contact.goal import TARED, State
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.messages import tip_pose
+from tactile_resonance.nodes.messages import tip_pose, write_force_over
 from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.srv import ForceOver
 
@@ -85,17 +85,13 @@ class ForceService:
     async def _on_request(
         self, request: ForceOver.Request, response: ForceOver.Response
     ) -> ForceOver.Response:
-        response.force_n = response.force_std_n = math.nan
-        response.force_rms_n = response.force_min_n = response.force_max_n = math.nan
         clock = self._clock()
         if clock is None:
-            response.reason = "contact_node is not active"
-            return response
+            return write_force_over(response, "contact_node is not active")
         start_ns = clock.own_ns(time_from_message(request.start))
         end_ns = clock.own_ns(time_from_message(request.end))
         if not start_ns < end_ns:
-            response.reason = "the interval is empty"
-            return response
+            return write_force_over(response, "the interval is empty")
         # while nothing is under way the loop looks seldom, and there is no force to wait for
         if end_ns > self._now_ns and self._state is not State.IDLE:
             future: Future = Future()
@@ -105,12 +101,10 @@ class ForceService:
             self._look()  # the loop may have come there meanwhile
             await future
         over = self._record.over(start_ns, end_ns)
-        response.force_n, response.force_std_n = over.force_n, over.force_std_n
-        response.force_rms_n = over.spread.rms_n
-        response.force_min_n, response.force_max_n = over.spread.min_n, over.spread.max_n
-        response.coverage, response.reason = over.coverage, over.reason
-        if self._state is State.IDLE and over.reason:
-            response.reason = "no contact was under way"
+        idle = self._state is State.IDLE and over.reason
+        reason = "no contact was under way" if idle else over.reason
+        write_force_over(response, reason, over.force_n, over.force_std_n, over.spread)
+        response.coverage = over.coverage
         if not math.isnan(over.position_m[0]):
             middle_ns = clock.ros_ns((start_ns + end_ns) // 2)
             response.tip_pose = tip_pose(

@@ -15,18 +15,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action.server import ServerGoalHandle
-from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.clock import ClockLostError, SimulatedClock
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.result import Cause, NotIdleError, refusal_cause
-from tactile_resonance.nodes.goal_thread import in_thread
-from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.messages import time_message
+from tactile_resonance.contact.result import Cause, ContactResult, NotIdleError, refusal_cause
+from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
+from tactile_resonance.nodes.messages import contact_result, time_message, write_force_over
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.recording.messages import time_from_message
@@ -36,6 +36,7 @@ CONTACT_S = 0.5
 """From a goal to the force that it asks for [s]: about as long as a robot that is near takes."""
 PUBLISH_S = 0.05
 MOST_STAYS = 1000
+NAN = math.nan
 
 
 @dataclass(frozen=True)
@@ -75,11 +76,8 @@ class Stays:
     def serve(self, request: ForceOver.Request, response: ForceOver.Response) -> ForceOver.Response:
         """The force over an interval, as the service `force_over` answers."""
         start_ns, end_ns = time_from_message(request.start), time_from_message(request.end)
-        response.force_n = response.force_std_n = math.nan
-        response.force_rms_n = response.force_min_n = response.force_max_n = math.nan
         if not start_ns < end_ns:
-            response.reason = "the interval is empty"
-            return response
+            return write_force_over(response, "the interval is empty")
         spans: list[tuple[float, float]] = []  # length [ns], force
         until_ns = end_ns
         for stay in reversed(self._stays):
@@ -91,14 +89,20 @@ class Stays:
         seen_ns = sum(span_ns for span_ns, _ in spans)
         response.coverage = seen_ns / (end_ns - start_ns)
         if until_ns > start_ns:
-            response.reason = f"the block begins before what is kept, {MOST_STAYS} places"
-            return response
+            text = f"the block begins before what is kept, {MOST_STAYS} places"
+            return write_force_over(response, text)
         mean_n = sum(span_ns * force_n for span_ns, force_n in spans) / seen_ns
         square = sum(span_ns * (force_n - mean_n) ** 2 for span_ns, force_n in spans) / seen_ns
-        response.force_n, response.force_std_n, response.force_rms_n = mean_n, 0.0, square**0.5
         forces_n = [force_n for _, force_n in spans]
-        response.force_min_n, response.force_max_n = min(forces_n), max(forces_n)
-        return response
+        spread = ForceSpread(square**0.5, min(forces_n), max(forces_n))
+        return write_force_over(response, "", mean_n, 0.0, spread)
+
+
+def _not_reached(cause: Cause, message: str) -> ContactResult:
+    return ContactResult(False, cause, message, total_s=NAN, peak_force_n=NAN)
+
+
+DRAWN_BACK = _not_reached(Cause.CANCELLED, "drawn back on request")
 
 
 class IdealContact:
@@ -137,13 +141,13 @@ class IdealContact:
         self._base_frame, self._frame_id = base_frame, frame_id
         self._lock = threading.Lock()
         self._drawn_back = threading.Event()
-        self._state, self._cause, self._message = State.IDLE, "", ""
-        self._depth_m = math.nan
+        self._state: State = State.IDLE
+        self._result: ContactResult | None = None
         self._stop = stop
         self._states = node.publish_on(msg.ContactState, "contact_state", STREAM)
         self._poses = node.publish_on(PoseStamped, "tcp_pose", STREAM)
         self._wrenches = node.publish_on(WrenchStamped, "wrench", STREAM)
-        node.serve(Trigger, "retract", self._on_retract)
+        node.serve_trigger("retract", self._on_retract)
         node.every(PUBLISH_S, self._publish)
         node.act(
             MakeContact,
@@ -157,57 +161,56 @@ class IdealContact:
         result = await in_thread(self._node, lambda: self._make(goal.request), "ideal contact")
         if goal.is_cancel_requested:
             self.draw_back()  # for a cancellation before the work began
-            goal.canceled()
-        elif result.reached:
-            goal.succeed()
-        else:
-            goal.abort()
-        return result
+        end_goal(goal, result.reached and not goal.is_cancel_requested)
+        return contact_result(result)
 
-    def _make(self, request: MakeContact.Goal) -> MakeContact.Result:
+    def _make(self, request: MakeContact.Goal) -> ContactResult:
         """Bring the tip there, taking as long as a contact takes."""
-        nan = math.nan
-        result = MakeContact.Result(force_n=nan, force_std_n=nan, depth_m=nan)
-        result.stiffness_n_per_m = result.surface_m = result.surface_std_m = nan
-        result.contact_s = result.total_s = result.peak_force_n = nan
         if not self._lock.acquire(blocking=False):
-            result.cause, result.message = Cause.BUSY.value, "goal: a contact is under way"
-            return result
+            return _not_reached(Cause.BUSY, "goal: a contact is under way")
         try:
             self._drawn_back.clear()  # a stop after this is seen in the wait, one before in the refusal
             try:
                 self._check(request)
             except ValueError as error:
-                result.cause, result.message = refusal_cause(error).value, str(error)
-                return result
-            self._say(State.APPROACH, "", "")
-            began_ns = self._now_ns()
-            if not self._wait(CONTACT_S):
-                self._say(State.IDLE, "cancelled", "drawn back on request")
-                result.cause, result.message = self._cause, self._message
-                return result
-            place = request.pose.pose.position
-            found = self._force_at(np.array([place.x, place.y, place.z]), request.force_n)
-            if found is None:
-                self._say(State.IDLE, "surface_missing", "nothing to touch there")
-                result.cause, result.message = self._cause, self._message
-                return result
-            self._depth_m, result.surface_m = found
-            now_ns = self._now_ns()
-            pose = PoseStamped(header=request.pose.header, pose=request.pose.pose)
-            pose.header.stamp = time_message(now_ns)
-            self._stays.add(Stay(now_ns, request.force_n, pose))
-            self._placed()
-            self._say(State.HOLD, "none", "")
-            if self._drawn_back.is_set():  # asked for after the wait
-                self.draw_back()
-            result.reached, result.cause, result.depth_m = True, "none", self._depth_m
-            result.force_n, result.force_std_n = request.force_n, 0.0
-            result.peak_force_n, result.surface_std_m = request.force_n, 0.0
-            result.contact_s = result.total_s = (now_ns - began_ns) * 1e-9
-            return result
+                return _not_reached(refusal_cause(error), str(error))
+            return self._touch(request)
         finally:
             self._lock.release()
+
+    def _touch(self, request: MakeContact.Goal) -> ContactResult:
+        self._say(State.APPROACH)
+        began_ns = self._now_ns()
+        if not self._wait(CONTACT_S):
+            return self._say(State.IDLE, DRAWN_BACK)
+        place = request.pose.pose.position
+        found = self._force_at(np.array([place.x, place.y, place.z]), request.force_n)
+        if found is None:
+            missing = _not_reached(Cause.SURFACE_MISSING, "nothing to touch there")
+            return self._say(State.IDLE, missing)
+        now_ns = self._now_ns()
+        pose = PoseStamped(header=request.pose.header, pose=request.pose.pose)
+        pose.header.stamp = time_message(now_ns)
+        self._stays.add(Stay(now_ns, request.force_n, pose))
+        self._placed()
+        took_s, (depth_m, surface_m) = (now_ns - began_ns) * 1e-9, found
+        reached = ContactResult(
+            reached=True,
+            cause=Cause.NONE,
+            message="",
+            total_s=took_s,
+            peak_force_n=request.force_n,
+            force_n=request.force_n,
+            force_std_n=0.0,
+            depth_m=depth_m,
+            surface_m=surface_m,
+            surface_std_m=0.0,
+            contact_s=took_s,
+        )
+        self._say(State.HOLD, reached)
+        if self._drawn_back.is_set():  # asked for after the wait
+            self.draw_back()
+        return reached
 
     def _check(self, request: MakeContact.Goal) -> None:
         """Raise ``ValueError`` where a goal is refused."""
@@ -238,11 +241,9 @@ class IdealContact:
             return False
         return not self._drawn_back.is_set()
 
-    def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_retract(self) -> str:
         self.draw_back()
-        response.success = True
-        response.message = "asked; contact_state reports when it is idle"
-        return response
+        return "asked; contact_state reports when it is idle"
 
     def draw_back(self) -> None:
         """Lift the tip off, also one that is on its way."""
@@ -250,30 +251,37 @@ class IdealContact:
         if self._state is State.HOLD:
             now_ns = self._now_ns()
             self._stays.add(Stay(now_ns, 0.0, self._stays.newest.pose))
-            self._depth_m = math.nan
             self._placed()
-            self._say(State.IDLE, "cancelled", "drawn back on request")
+            self._say(State.IDLE, DRAWN_BACK)
 
-    def _say(self, state: State, cause: str, message: str) -> None:
-        self._state, self._cause, self._message = state, cause, message
+    def _say(self, state: State, result: ContactResult | None = None) -> ContactResult:
+        """Publish from now on a state, and what became of the contact; None: not known yet."""
+        self._state, self._result = state, result
         self._publish()
+        return result
 
     def _publish(self) -> None:
         now = time_message(self._now_ns())
-        stay = self._stays.newest
-        state = msg.ContactState(state=self._state.value, cause=self._cause, message=self._message)
+        stay, result = self._stays.newest, self._result
+        state = msg.ContactState(state=self._state.value, force_n=NAN, depth_m=NAN)
         state.header.stamp, state.header.frame_id = now, self._frame_id
         state.instance, state.stopped = self._node.instance, self._stop.stopped
-        holds = self._state is State.HOLD
-        state.force_n = stay.force_n if holds else math.nan
-        state.zero_moved_n = math.nan
-        state.depth_m, state.stiffness_n_per_m = self._depth_m, math.nan
+        state.zero_moved_n = state.stiffness_n_per_m = NAN
+        if result is not None:
+            state.cause, state.message = result.cause.value, result.message
+        if self._state is State.HOLD:
+            state.force_n, state.depth_m = stay.force_n, result.depth_m
         self._states.publish(state)
         if stay.pose.header.frame_id:
             pose = PoseStamped(header=stay.pose.header, pose=stay.pose.pose)
             pose.header.stamp = now
             self._poses.publish(pose)
-        wrench = WrenchStamped()
-        wrench.header.stamp, wrench.header.frame_id = now, self._frame_id
-        wrench.wrench.force.z = stay.force_n
-        self._wrenches.publish(wrench)
+        self._wrenches.publish(pressing(stay.force_n, now, self._frame_id))
+
+
+def pressing(force_n: float, stamp: Time, frame_id: str) -> WrenchStamped:
+    """Wrench of a force along the normal."""
+    wrench = WrenchStamped()
+    wrench.header.stamp, wrench.header.frame_id = stamp, frame_id
+    wrench.wrench.force.z = force_n
+    return wrench

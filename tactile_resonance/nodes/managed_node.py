@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 import os
+import threading
 import time
 import traceback
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -15,13 +18,16 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.client import Client
 from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import await_or_execute
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.publisher import LifecyclePublisher
 from rclpy.qos import QoSProfile
+from rclpy.task import Future
 from rclpy.timer import Timer
+from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.contact.interfaces import ArmError, ForceError
@@ -158,6 +164,25 @@ class ManagedNode(LifecycleNode):
         service = self.create_service(kind, name, callback, callback_group=group)
         self.resources.callback(self.destroy_service, service)
 
+    def serve_trigger(self, name: str, do: Callable[[], str]) -> None:
+        """Service without a request; `do` returns the answer's message, or raises ``ValueError`` with why."""
+
+        def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.message = do()
+                response.success = True
+            except ValueError as error:
+                response.message = str(error)
+            return response
+
+        self.serve(Trigger, name, serve)
+
+    def client_of(self, kind: type, name: str) -> Client:
+        """Client of a service until the node is cleaned up."""
+        client = self.create_client(kind, name)
+        self.resources.callback(self.destroy_client, client)
+        return client
+
     def act(
         self,
         kind: type,
@@ -228,6 +253,11 @@ class ManagedNode(LifecycleNode):
     def hung_after_s(self) -> float:
         """In simulated time: how long an answer is waited for, by the machine's clock [s]."""
         return float(values(self, HUNG_AFTER.name)[0])
+
+    def require_active(self) -> None:
+        """Raise ``ValueError`` where the node is not active."""
+        if not self.active:
+            raise ValueError(f"{self.get_name()} is {self.state_name()}")
 
     def fail(self, reason: str) -> None:
         """Give up for a reason: back to unconfigured, from where the manager restarts it.
@@ -326,3 +356,42 @@ class ManagedNode(LifecycleNode):
             self.active = False
             self.deactivate()
         self.resources.close()
+
+
+async def in_thread(node: ManagedNode, work: Callable[[], Any], name: str) -> Any:
+    """Result of long `work`, done in a thread of that name while the executor goes on.
+
+    A future that is set from another thread may never wake its coroutine; a guard condition wakes the
+    executor, which sets it.
+    """
+    outcome: concurrent.futures.Future = concurrent.futures.Future()
+    finished = Future()
+
+    def wake() -> None:
+        if outcome.done() and not finished.done():
+            finished.set_result(None)
+
+    guard = node.create_guard_condition(wake)
+
+    def run() -> None:
+        try:
+            outcome.set_result(work())
+        except Exception as error:
+            outcome.set_exception(error)
+        with contextlib.suppress(InvalidHandle):  # the node has gone, and nobody waits
+            guard.trigger()
+
+    threading.Thread(target=run, name=name, daemon=True).start()
+    await finished
+    node.destroy_guard_condition(guard)
+    return outcome.result()
+
+
+def end_goal(goal: ServerGoalHandle, done: bool) -> None:
+    """Tell the client of a goal how it ended."""
+    if done:
+        goal.succeed()
+    elif goal.is_cancel_requested:
+        goal.canceled()
+    else:
+        goal.abort()

@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
+from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim, HoldMode
@@ -30,6 +31,7 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.messages import (
     PROTOCOLS,
+    SPREAD,
     array_of,
     bands_from_message,
     complex_of,
@@ -47,6 +49,7 @@ from tactile_resonance.recording.messages import (
     write_pose,
     write_record,
 )
+from tactile_resonance.srv import ForceOver
 
 if TYPE_CHECKING:  # nodes without contact control do not load it
     from tactile_resonance.contact.estimator import ContactEstimate
@@ -60,6 +63,8 @@ FRF_OPTIONAL = (
     *("variance_noise", "variance_total"),
     *("actuator_amplitude", "sensor_variance_given_actuator"),
 )
+
+UNKNOWN_SPREAD = ForceSpread()
 
 RosTime = Callable[[int], int]
 """From a time of the loop's clock [ns] to ROS time [ns]."""
@@ -297,6 +302,20 @@ def contact_feedback(
     """How far a contact of an action is."""
     force_n, depth_m, _ = _known(estimate)
     return kind.Feedback(state=state, force_n=force_n, depth_m=depth_m)
+
+
+def write_force_over(
+    response: ForceOver.Response,
+    reason: str = "",
+    force_n: float = math.nan,
+    force_std_n: float = math.nan,
+    spread: ForceSpread = UNKNOWN_SPREAD,
+) -> ForceOver.Response:
+    """Write the force over an interval, or why it is not known."""
+    response.reason, response.force_n, response.force_std_n = reason, force_n, force_std_n
+    for name in SPREAD:
+        setattr(response, f"force_{name}", getattr(spread, name))
+    return response
 
 
 def wrench_message(

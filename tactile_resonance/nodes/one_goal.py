@@ -10,8 +10,7 @@ from typing import Any
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
-from tactile_resonance.nodes.goal_thread import in_thread
-from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.managed_node import ManagedNode, in_thread
 from tactile_resonance.scan.progress import Controls, Request
 
 RUNNING = "a scan or a calibration is running, cancel it or wait for its result"

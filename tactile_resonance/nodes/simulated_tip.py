@@ -1,29 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tip of the simulated sensor touches: as goals or poses put it, or as the simulated robot has it."""
+"""What the tip of the simulated sensor touches: as goals or poses put it, or as the simulated robot has it.
+
+The true poles there are on the topic `bench/truth` and behind the service `bench/get_truth`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
-from tactile_resonance.nodes.ideal_contact import IdealContact, Stay, Stays
+from tactile_resonance import msg
+from tactile_resonance.contact.force_spread import ForceSpread
+from tactile_resonance.nodes.bench_player import PlantChild
+from tactile_resonance.nodes.ideal_contact import IdealContact, Stay, Stays, pressing
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.messages import pose_to_message
+from tactile_resonance.nodes.messages import poles_to_message, pose_to_message
 from tactile_resonance.nodes.parameters import pose_of, values
-from tactile_resonance.nodes.plant_child import PlantChild
-from tactile_resonance.nodes.running import PLACES, STREAM
+from tactile_resonance.nodes.running import PLACES, STREAM, TRUTHS
 from tactile_resonance.nodes.stop_input import StopInput
-from tactile_resonance.nodes.truth_topic import TruthTopic
-from tactile_resonance.record import Contact
+from tactile_resonance.poles.result import Poles, PolesStatus
+from tactile_resonance.record import Contact, Origin
+from tactile_resonance.recording.messages import (
+    contact_from_message,
+    fill,
+    fill_complex,
+    time_from_message,
+)
 from tactile_resonance.simulation.plant.tabletop import LaidScene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import parts_of
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, parts_of
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactState
 from tactile_resonance.simulation.tissue.scene import PhantomScene
 from tactile_resonance.srv import ForceOver
+from tactile_resonance.srv import Truth as TruthService
 
 PLANT_CHECK_S = 0.5
 CLEAR_M = 0.05  # above the table: where an ideal contact's tip is before its first goal
@@ -49,7 +62,6 @@ class SimulatedTip:
     ----------
     tip : BenchTip
     stays : Stays
-    truth : TruthTopic
     stalls : int
         How often the simulated robot stood still.
     """
@@ -68,7 +80,7 @@ class SimulatedTip:
         table, self._frame_id, base_frame = values(node, "table_in_base", "frame_id", "base_frame")
         self._laid = LaidScene(scene, pose_of(table, "table_in_base"))
         self.tip, self.stays, self.stalls = BenchTip(None, 0.0, 1.0), Stays(), 0
-        self.truth = TruthTopic(node, bench, self._frame_id)
+        self._truths = node.publish_on(msg.Poles, "bench/truth", TRUTHS)
         self._contact: IdealContact | None = None
         if plant is not None:
             node.every(PLANT_CHECK_S, self._check_plant)
@@ -109,19 +121,22 @@ class SimulatedTip:
         if self.plant is None:
             return
         try:
-            true = self.plant.truth()
+            true = self.plant.ask("truth")
         except OSError as error:
             raise ValueError(f"the simulated robot does not answer: {error}") from error
-        self.stalls = true.stalls
-        touching = true.force_n > 0
-        tissue = self._laid.tissue_at(true.site_m) if touching else None
-        tip = BenchTip(tissue, true.force_n, true.since_s or 1.0)
-        if touching:
-            tip = replace(tip, contact_radius_m=true.contact_radius_m, depth_m=true.depth_m)
-        x, y, z = true.tip_m.tolist()
+        self.stalls, force_n = true["stalls"], true["normal_force_n"]
+        tip = BenchTip(None, force_n, true["contact_s"] or 1.0)
+        if force_n > 0:
+            tip = replace(
+                tip,
+                tissue=self._laid.tissue_at(np.array(true["site_m"] or true["tip_m"])),
+                contact_radius_m=true["contact_radius_m"],
+                depth_m=true["depth_m"],
+            )
+        x, y, z = true["tip_m"]
         place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self._now_ns())
-        self._plant_ahead_s = true.time_s - place.time_ns * 1e-9
-        self.stays.add(Stay(place.time_ns, true.force_n, pose_to_message(place)))
+        self._plant_ahead_s = true["time_s"] - place.time_ns * 1e-9
+        self.stays.add(Stay(place.time_ns, force_n, pose_to_message(place)))
         self._put(tip)
 
     def contact_over(self, from_ns: int, to_ns: int) -> list[ContactState | None]:
@@ -130,13 +145,27 @@ class SimulatedTip:
         from_s, to_s = (ns * 1e-9 + self._plant_ahead_s for ns in (from_ns, to_ns))
         parts = parts_of(to_s - from_s)
         try:
-            return self.plant.contact_over(from_s, to_s, parts)
+            answer = self.plant.ask("contact_over", after_s=from_s, until_s=to_s, parts=parts)
         except OSError:
             return [None] * parts
+        names = ("normal_force_n", "contact_radius_m", "depth_m")
+        rows = zip(*(answer[name] for name in names), strict=True)
+        return [None if row[0] is None else row for row in rows]
+
+    def tell_truth(
+        self,
+        pose: PoseStamped,
+        tip: BenchTip,
+        measurement_id: int = 0,
+        parts: Sequence[CoupledBimorph] = (),
+    ) -> None:
+        """Publish the exact poles of a tip at a pose; see `truth_message`."""
+        coupled = parts or [tip.coupled(self._bench)]
+        self._truths.publish(truth_message(pose, tip, coupled, measurement_id, self._frame_id))
 
     def _put(self, tip: BenchTip) -> None:
         self.tip = tip
-        self.truth.publish(self.stays.newest.pose, tip)
+        self.tell_truth(self.stays.newest.pose, tip)
 
     def _found_at(self, place_m: np.ndarray, force_n: float) -> tuple[float, float] | None:
         """Depth that brings a force at a place in the base, and height of the surface above that place."""
@@ -162,13 +191,84 @@ class SimulatedTip:
         tip = self.at((position.x, position.y, position.z))
         tip = tip if tip.tissue else replace(tip, force_n=0.0)
         self.stays.add(Stay(self._now_ns(), tip.force_n, message))
-        wrench = WrenchStamped()
-        wrench.header.stamp = message.header.stamp
-        wrench.header.frame_id = self._frame_id
-        wrench.wrench.force.z = tip.force_n
+        wrench = pressing(tip.force_n, message.header.stamp, self._frame_id)
         self._wrench.publish(wrench)
         self._put(tip)
 
     def _check_plant(self) -> None:
         if self.plant is not None and not self.plant.alive:
             self._node.fail("the simulated robot has ended; restarting it")
+
+
+def truth_message(
+    pose: PoseStamped,
+    tip: BenchTip,
+    coupled: Sequence[CoupledBimorph],
+    measurement_id: int,
+    frame_id: str,
+) -> msg.Poles:
+    """Exact modes of a tip at a pose and its time.
+
+    Parameters
+    ----------
+    pose : PoseStamped
+    tip : BenchTip
+    coupled : sequence of CoupledBimorph
+        The tip as it is, or a contact that changes, in equal parts: modes and force are means over them, as an
+        estimate has them.
+    measurement_id : int
+        Of the measurement whose poles they are; 0: of none.
+    frame_id : str
+        Of the tip.
+    """
+    modes = [each.modes for each in coupled]
+    forces_n = [each.contact.force_n if each.contact else 0.0 for each in coupled]
+
+    def mean(name: str) -> npt.NDArray:
+        return np.mean([[getattr(mode, name) for mode in at] for at in modes], axis=0)
+
+    truth = Poles(
+        poles_rad_s=mean("pole_rad_s"),
+        f0_hz=mean("f0_hz"),
+        damping_ratio=mean("damping_ratio"),
+        residues=mean("residue_rad_s"),
+        method="simulation",
+        status=PolesStatus.TRUTH,
+        message="exact poles of the simulated sensor on this tissue",
+    )
+    origin = Origin(
+        measurement_id=measurement_id,
+        time_ns=time_from_message(pose.header.stamp),
+        final=True,
+        frame_id=frame_id,
+        label=tip.tissue.name if tip.tissue else "air",
+        simulated=True,
+        contact=replace(
+            contact_from_message(pose, float(np.mean(forces_n)), 0.0),
+            spread=ForceSpread(float(np.std(forces_n)), min(forces_n), max(forces_n)),
+        ),
+    )
+    return poles_to_message(truth, origin)
+
+
+def truth_to_response(
+    truth: CoupledBimorph, frequency_hz: Sequence[float], response: TruthService.Response
+) -> None:
+    """Fill the answer of `bench/get_truth`, with the response at frequencies (F,) [Hz]."""
+    response.success = True
+    response.feedthrough = truth.feedthrough
+    fill_complex(response, "pole_", truth.poles_rad_s, "_rad_s")
+    fill_complex(response, "residue_", truth.residues_rad_s, "_rad_s")
+    fill(response.f0_hz, [mode.f0_hz for mode in truth.modes])
+    fill(response.damping_ratio, [mode.damping_ratio for mode in truth.modes])
+    frequency = np.asarray(frequency_hz, dtype=float)
+    fill_complex(response, "response_", truth.frequency_response(frequency))
+    contact = truth.contact
+    if contact is not None:
+        response.tissue = contact.tissue.name
+        response.force_n = contact.force_n
+        response.contact_radius_m = contact.contact_radius_m
+        response.indentation_m = contact.indentation_m
+        response.relaxation_modulus_1s_pa = contact.tissue.relaxation_modulus_1s_pa
+        stiffness = contact.dynamic_stiffness(2j * np.pi * frequency)
+        fill_complex(response, "stiffness_", stiffness, "_n_per_m")

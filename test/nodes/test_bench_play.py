@@ -10,7 +10,6 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from rclpy.executors import SingleThreadedExecutor
 from spinning import spin_until
-from std_srvs.srv import Trigger
 from tactile_resonance.srv import Play
 
 from tactile_resonance import msg
@@ -45,7 +44,7 @@ def bench():
             assert spin_until(executor, lambda: any(b.block_index == PERIODS - 1 for b in found()))
             return [b.block_index for b in found()]
 
-        yield ask, all_of, lambda: node._on_stop(Trigger.Request(), Trigger.Response())
+        yield ask, all_of, node._silence
         node.trigger_deactivate()
         node.destroy_node()
 

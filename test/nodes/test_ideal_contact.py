@@ -25,7 +25,7 @@ from tactile_resonance.msg import ContactState
 from tactile_resonance.srv import ForceOver
 
 from tactile_resonance.clock import Demand, SimulatedClock
-from tactile_resonance.nodes import goal_thread, ideal_contact
+from tactile_resonance.nodes import ideal_contact, managed_node
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.ideal_contact import CONTACT_S, MOST_STAYS, Stay, Stays
 from tactile_resonance.nodes.messages import time_message
@@ -312,7 +312,7 @@ def test_a_contact_that_is_cancelled_before_its_work_begins_leaves_no_tip_pressi
         held.append(True)
         return threading.Thread(*args, target=work, **options)
 
-    monkeypatch.setattr(goal_thread, "threading", SimpleNamespace(Thread=late))
+    monkeypatch.setattr(managed_node, "threading", SimpleNamespace(Thread=late))
     handle, future = ideal.make(goal_at())
     ideal.wait(lambda: held)
     ideal.answer(handle.cancel_goal_async())

@@ -62,7 +62,7 @@ def tell(bench, number):
     for k in range(number):
         pose = PoseStamped()
         pose.header.stamp = time_message(1000 + k)
-        bench._touch.truth.publish(pose, BenchTip(None, 0.0, 1.0), KEY)
+        bench._touch.tell_truth(pose, BenchTip(None, 0.0, 1.0), KEY)
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -76,7 +76,7 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
     with RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run:
         with run.begin_point(0) as recording:
             recorder.record_into(recording, KEY)
-            assert spin_until(executor, bench._touch.truth._publisher.get_subscription_count)
+            assert spin_until(executor, bench._touch._truths.get_subscription_count)
             if not late:
                 tell(bench, TRUTHS)
             assert spin_until(executor, lambda: recorder._counts["bench/truth"] >= TRUTHS)

@@ -2,7 +2,6 @@
 """The truth of a contact that creeps is the mean over the record, as an estimate has it."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from geometry_msgs.msg import PoseStamped
 
-from tactile_resonance.nodes.truth_topic import TruthTopic
+from tactile_resonance.nodes.simulated_tip import truth_message
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -20,14 +19,11 @@ from tactile_resonance.simulation.tissue.library import read_tissues
 
 def test_truth_of_a_contact_that_changes_is_its_mean():
     bench, tissue = SimulatedBench.from_configuration(), read_tissues()["cortex"]
-    tip, told = BenchTip(tissue, 0.01, 0.3), []
-    node = SimpleNamespace(publish_on=lambda *_: SimpleNamespace(publish=told.append))
-    topic = TruthTopic(node, bench, "tip")
+    tip = BenchTip(tissue, 0.01, 0.3)
     forces = np.linspace(0.009, 0.012, 7)
     parts = [replace(tip, force_n=force).coupled(bench) for force in forces]
-    topic.publish(PoseStamped(), tip, 5, parts)
-    topic.publish(PoseStamped(), tip)
-    over, now = told
+    over = truth_message(PoseStamped(), tip, parts, 5, "tip")
+    now = truth_message(PoseStamped(), tip, [tip.coupled(bench)], 0, "tip")
     each = [[(m.f0_hz, m.damping_ratio, m.pole_rad_s.imag) for m in part.modes] for part in parts]
     means = np.mean(each, axis=0).T
     np.testing.assert_allclose([over.f0_hz, over.damping_ratio, over.imag_rad_s], means, rtol=1e-12)
