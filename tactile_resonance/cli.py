@@ -76,6 +76,7 @@ def _parser() -> OneLineParser:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from tactile_resonance.commands import (
         analyze,
+        bench_scan,
         benchmark,
         calibrate,
         calibrate_table,
@@ -89,9 +90,7 @@ def _parser() -> OneLineParser:
         references,
         reidentify,
         report,
-        scan,
-        simulate_cell,
-        simulate_ur,
+        simulate,
     )
 
     parser = OneLineParser(
@@ -101,9 +100,9 @@ def _parser() -> OneLineParser:
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (
-        *(plan, scan, live, analyze, reidentify, calibrate, references),
-        *(compare, mechanics, report, figures, benchmark, calibrate_table, simulate_ur),
-        *(simulate_cell, check_robot, compile),
+        *(plan, bench_scan, live, analyze, reidentify, calibrate, references),
+        *(compare, mechanics, report, figures, benchmark, calibrate_table, simulate),
+        *(check_robot, compile),
     ):
         command.add_parser(commands)
     return parser

@@ -164,7 +164,7 @@ BAD = {
         ("--order", "auto", "--numerator-order", 7),
         "numerator_order (--numerator-order): got",
     ),
-    "output folder": (damaged(), ("--json", "/nonexistent/out.json"), "--json: /nonexistent"),
+    "output folder": (damaged(), ("--json", "/nonexistent/out.json"), "--json: got '/nonexistent"),
     "measurement": (damaged(), ("--measurement", 3), "measurement_id (--measurement): 3, only for"),
     "period": (
         damaged(),
@@ -178,7 +178,7 @@ BAD = {
     ),
     "segments": (damaged(), ("--segments", "5:3"), "segments (--segments): 5:3, expected"),
     "lines": (damaged(), ("--harmonics", "1:1000"), "excited_harmonics (--harmonics): "),
-    "figure kind": (damaged(), ("--plot", "out.docx"), "--plot: out.docx"),
+    "figure kind": (damaged(), ("--plot", "out.docx"), "--plot: got 'out.docx"),
 }
 
 
@@ -343,10 +343,10 @@ def test_outputs_never_replace_what_they_must_not(good, tmp_path, capsys):
     fifo = tmp_path / "device"
     os.mkfifo(fifo)
     for options, message in (
-        (["--json", good], "is the record itself"),
-        (["--json", fifo], "not a regular file"),
-        (["--json", tmp_path], "not a regular file"),
-        (["--json", tmp_path / "a.png", "--plot", tmp_path / "a.png"], "expected two files"),
+        (["--json", good], "accepted is another file than the record itself"),
+        (["--json", fifo], "accepted is a new file, or a regular one to replace"),
+        (["--json", tmp_path], "accepted is a new file, or a regular one to replace"),
+        (["--json", tmp_path / "a.png", "--plot", tmp_path / "a.png"], "accepted is two files"),
     ):
         assert cli.main(["analyze", str(good), *map(str, options)]) == 1
         printed = capsys.readouterr()

@@ -59,8 +59,8 @@ def test_lines_that_mean_nothing_are_said():
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["--port", "70000"], "--port: 70000, expected 0 to 65535"),
-        (["--seed", "-1"], "--seed: -1"),
+        (["--port", "70000"], "--port: got 70000; accepted is 0 to 65535"),
+        (["--seed", "-1"], "--seed: got -1"),
         (["--cell", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
@@ -73,7 +73,7 @@ def test_what_is_wrong_is_said_in_one_line(capsys, options, reason):
 
 def test_others_than_this_machine_are_not_served(capsys):
     assert main(["simulate-cell", "--host", "0.0.0.0"]) == 1
-    assert "host: '0.0.0.0', expected an address 127.x.y.z" in capsys.readouterr().err
+    assert "host: got '0.0.0.0'; accepted is an address 127.x.y.z" in capsys.readouterr().err
 
 
 def test_a_port_in_use_is_said(capsys):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`tactile_resonance analyze`: FRF and poles of a recorded measurement."""
+"""`tactile_resonance analyze`: FRF and poles of a recorded measurement, or contacts through a known sensor."""
 
 from __future__ import annotations
 
 import argparse
-import os
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +17,14 @@ from tactile_resonance.analysis import (
     analyse,
     analysis_as_json,
 )
-from tactile_resonance.commands.analyze_contact import analyze_contacts
-from tactile_resonance.fields import band
+from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
+from tactile_resonance.calibration.validity import as_of_today
+from tactile_resonance.commands.options import FIGURES, add_band, check_output
+from tactile_resonance.contact_analysis import ContactAnalysis, contact_content, estimate_contact
+from tactile_resonance.fields import band, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
-from tactile_resonance.front import read_record
+from tactile_resonance.front import read_record, read_run
 from tactile_resonance.poles.order_choice import CANDIDATES
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording
@@ -92,13 +95,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="excited multiples of the sample rate over the samples per period, LAST included; "
         "default: the file's, else found from the spectrum of u",
     )
-    parser.add_argument(
-        "--band",
-        type=float,
-        nargs=2,
-        metavar=("LO", "HI"),
-        help="[Hz] of the fit; default: around the strongest resonance",
-    )
+    add_band(parser, "around the strongest resonance")
     parser.add_argument(
         "--order",
         type=parse_order,
@@ -238,7 +235,7 @@ def _run(options: argparse.Namespace) -> int:
 
         options.measurement = measurement_at(options.record, options.point)
     if options.calibration is not None:
-        return analyze_contacts(options, lambda key: _recording(options, key), as_text)
+        return _analyze_contacts(options)
     recording = _recording(options)
     rate_hz = recording.sample_rate_hz
     band_hz = None if options.band is None else band(options.band, most_hz=rate_hz / 2)
@@ -334,20 +331,98 @@ def as_text(analysis: Analysis) -> str:
 
 def _check_outputs(options: argparse.Namespace) -> None:
     """Refuse an impossible output before any work is done."""
-    for name in ("json", "plot"):
-        path = getattr(options, name)
-        if path is None:
-            continue
-        if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-            raise ValueError(f"--{name}: {path}, expected a file in a folder that can be written")
-        if path.exists() and not path.is_file():
-            raise ValueError(
-                f"--{name}: {path} is not a regular file, expected a new one or one to replace"
-            )
-        if path.exists() and options.record.exists() and path.samefile(options.record):
-            raise ValueError(f"--{name}: {path} is the record itself, expected another file")
-    if options.json is not None and options.json == options.plot:
-        raise ValueError(f"--json, --plot: both {options.json}, expected two files")
-    accepted = (".png", ".pdf", ".svg")
-    if options.plot is not None and options.plot.suffix.lower() not in accepted:
-        raise ValueError(f"--plot: {options.plot}, accepted are {', '.join(accepted)}")
+    for name, endings in (("json", ()), ("plot", FIGURES)):
+        if (path := getattr(options, name)) is not None:
+            check_output(f"--{name}", path, endings)
+            own = path.exists() and options.record.exists() and path.samefile(options.record)
+            require(not own, f"--{name}", str(path), "another file than the record itself")
+    same = options.json is not None and options.json == options.plot
+    require(not same, "--json, --plot", str(options.json), "two files")
+
+
+def _analyze_contacts(options: argparse.Namespace) -> int:
+    """Contact of one record, or of each point of a run."""
+    for name in ("plot", "silent", "distortion"):
+        if getattr(options, name):
+            raise ValueError(f"--{name}: not with --calibration")
+    sensor = read_calibration(options.calibration)
+    if (options.record / "run.json").is_file():
+        sensor = _as_of_run(options.record, sensor)
+    contents = {}
+    for key, label, (force_n, force_std_n) in _pressed(options):
+        found = estimate_contact(
+            _recording(options, key),
+            sensor,
+            band_hz=options.band,
+            force_n=force_n if options.force is None else options.force,
+            force_std_n=force_std_n if options.force is None else 0.0,
+            from_rest=options.from_rest,
+            relaxed_ratio=options.relaxed_ratio,
+        )
+        print(contact_as_text(found, label))
+        contents[key] = contact_content(found)
+    if options.json:
+        one = len(contents) == 1
+        content = next(iter(contents.values())) if one else contents
+        write_whole(options.json, json.dumps(content, indent=1, allow_nan=False).encode())
+    return 0
+
+
+def _as_of_run(run: Path, sensor: CalibratedSensor) -> CalibratedSensor:
+    """The sensor as the run found it in air, which is printed."""
+    content = read_run(run)
+    from tactile_resonance.scan.references import calibration_in_air
+
+    found = calibration_in_air(content, sensor.calibration)
+    print(f"sensor in air: {found.message}")
+    return replace(sensor, calibration=as_of_today(sensor.calibration, found))
+
+
+def _pressed(
+    options: argparse.Namespace,
+) -> list[tuple[int | None, str, tuple[float, float]]]:
+    """Measurement, name, force and its deviation [N] of each record that is asked for."""
+    unknown = (float("nan"), 0.0)
+    if not (options.record / "run.json").is_file():
+        return [(options.measurement, "", unknown)]
+    wanted = options.measurement
+    points = [
+        (of.measurement_id, f"point {of.index} {of.label}".strip(), (of.force_n, of.force_std_n))
+        for of in read_run(options.record).results
+        if of.blocks and wanted in (None, of.measurement_id)
+    ]
+    points = [
+        (key, label, force if np.isfinite(force).all() else unknown) for key, label, force in points
+    ]
+    if not points and wanted is not None:  # a reference
+        return [(wanted, "", unknown)]
+    if not points:
+        raise ValueError(f"{options.record}: no point with a record")
+    return [*points]
+
+
+def contact_as_text(analysis: ContactAnalysis, label: str = "") -> str:
+    """What a person reads first of a contact."""
+    contact, moduli, main = analysis.contact, analysis.moduli, analysis.contact.poles.main
+    k, k_std = contact.stiffness_n_per_m, np.sqrt(np.diag(contact.stiffness_total))
+    noise = np.sqrt(np.diag(contact.stiffness_covariance))
+    head = f"{label}: " if label else ""
+    lines = [
+        f"{head}contact: k' {k.real:.3f} +- {k_std[0]:.2g} N/m, k'' {k.imag:.3f} +- {k_std[1]:.2g} N/m "
+        f"at {main.f0_hz:.2f} Hz (from noise alone +- {noise[0]:.2g}, {noise[1]:.2g})",
+        f"mode: f0 {main.f0_hz:.4f} +- {main.std[0]:.2g} Hz, damping ratio {main.damping_ratio:.6f} "
+        f"+- {main.std[1]:.2g}; {contact.poles.method}",
+    ]
+    if np.isfinite(moduli.storage_pa):
+        lines.append(
+            f"moduli: storage {moduli.storage_pa / 1e3:.4g} +- {moduli.storage_std_pa / 1e3:.2g} kPa, loss "
+            f"{moduli.loss_pa / 1e3:.4g} +- {moduli.loss_std_pa / 1e3:.2g} kPa; contact radius "
+            f"{1e3 * moduli.contact_radius_m:.3g} mm, {moduli.radius_ratio:.2f} of the ball's"
+        )
+    if contact.status.value != "ok":
+        lines.append(f"status: {contact.status.value}")
+    lines += [f"note: {warning}" for warning in analysis.warnings]
+    if analysis.black_box is not None:
+        lines.append("without the calibration:")
+        lines += [f"  {line}" for line in as_text(analysis.black_box).splitlines()]
+    return "\n".join(lines)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scan on the simulated bench with all nodes as processes: what `demo`, `scan` and `resume` share."""
+"""`tactile_resonance demo`, `scan` and `resume`: scans on the simulated bench, with all nodes as processes."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ import math
 import os
 import shutil
 import signal
-import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.calibration.file import read_calibration
+from tactile_resonance.commands.options import Progress, require_packages
 from tactile_resonance.counted import counted
+from tactile_resonance.fields import require
 from tactile_resonance.processes import (
     ENDING,
     NodeProcesses,
@@ -42,7 +44,25 @@ HUNG_AFTER_S = 60.0
 """A scan_node that is silent for so long hangs; it reports each second, and watches the other nodes itself."""
 LOOK_S = 3.0  # nodes in a domain are found within this
 START_WITHIN_S = 300.0  # they come up in seconds; a machine with much else to do takes longer
-INTERRUPTED = 130
+
+
+NEW_RUNS = {
+    "demo": (
+        "demo.yaml",
+        "a short scan over a hidden inclusion, on the simulated bench",
+        "What `scan` does, on a scene that takes little more than a minute: a simulated robot brings the "
+        "sensor to 1 cN at up to 16 points of a gelatine phantom, chosen for the boundary of something stiffer "
+        "hidden in it; boundary, poles, map and table follow, beside the simulation's truth. Nothing here is a "
+        "measurement.",
+    ),
+    "scan": (
+        "inclusion_scan.yaml",
+        "a scan on the simulated bench, with robot, load cell and map",
+        "Start the nodes, a simulated robot and load cell as processes on loopback; touch every point of a "
+        "scene at its force, measure until it is precise enough, record. Nothing here is a measurement.",
+    ),
+}
+"""Scene, help and description of the commands that begin a run."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +94,36 @@ class Job:
     calibration: Path | None = None
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of all three commands."""
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Options of the three commands."""
+    for name, (scene, text, description) in NEW_RUNS.items():
+        parser = commands.add_parser(name, help=text, description=description)
+        parser.add_argument(
+            "--scene", type=Path, help=f"scene file (default: the package's {scene})"
+        )
+        parser.add_argument(
+            "--output", type=Path, metavar="DIR", help=f"default: runs/{name}-DATE-TIME"
+        )
+        parser.add_argument("--seed", type=int, default=1, help="of phases and noise (default: 1)")
+        parser.add_argument(
+            "--notes",
+            default="",
+            metavar="YAML",
+            help="of the session, for example '{temperature_c: 21.5, tip_wetness: wet, adhesion: none}'",
+        )
+        _add_options(parser)
+        parser.set_defaults(job=partial(_new_job, scene=scene, name=name))
+    parser = commands.add_parser(
+        "resume",
+        help="go on with a scan that was ended or killed",
+        description="Go on with the next point of a run on the simulated bench.",
+    )
+    parser.add_argument("output", type=Path, metavar="RUN", help="folder of the run")
+    _add_options(parser)
+    parser.set_defaults(job=_resumed_job)
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
     add_robot_host(parser)
     parser.add_argument(
         "--calibration",
@@ -89,6 +137,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="on the wall clock, as with hardware: what this machine is too slow for is late, and repeated "
         "(default: simulated time, in which a slow machine takes longer and nothing else)",
     )
+    parser.set_defaults(run=lambda options: run_job(options.job(options)))
 
 
 def add_robot_host(parser: argparse.ArgumentParser) -> None:
@@ -108,36 +157,18 @@ def take_domain(host: str) -> str:
     return host or f"127.0.2.{domain + 1}"
 
 
-def add_scene_options(parser: argparse.ArgumentParser, scene: str, output: str) -> None:
-    """Options of a new run."""
-    parser.add_argument("--scene", type=Path, help=f"scene file (default: the package's {scene})")
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help=f"default: runs/{output}-DATE-TIME"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="of phases and noise (default: 1)")
-    parser.add_argument(
-        "--notes",
-        default="",
-        metavar="YAML",
-        help="of the session, for example '{temperature_c: 21.5, tip_wetness: wet, adhesion: none}'",
-    )
-    add_options(parser)
-
-
-def new_job(options: argparse.Namespace, scene: str, output: str) -> Job:
-    """Job of the options of a new run."""
+def _new_job(options: argparse.Namespace, scene: str, name: str) -> Job:
     from tactile_resonance.configuration import share_path
     from tactile_resonance.scan.notes import parse_notes
 
     parse_notes(options.notes, "--notes")
-    if not 1 <= options.seed <= 2**31:
-        raise ValueError(f"--seed: {options.seed}, expected 1 to 2^31")
+    require(1 <= options.seed <= 2**31, "--seed", options.seed, "1 to 2^31")
     if options.scene is not None and not options.scene.is_file():
         what = "a folder" if options.scene.is_dir() else "not there"
         raise ValueError(f"--scene: {options.scene} is {what}; accepted is a scene file")
     if options.output is not None and options.output.is_file():
         raise ValueError(f"--output: {options.output} is a file; accepted is a new or empty folder")
-    folder = options.output or Path("runs") / time.strftime(f"{output}-%Y%m%d-%H%M%S")
+    folder = options.output or Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
     return Job(
         (options.scene or share_path(f"config/scenes/{scene}")).resolve(),
         folder.resolve(),
@@ -145,11 +176,25 @@ def new_job(options: argparse.Namespace, scene: str, output: str) -> Job:
         options.seed,
         real_time=options.real_time,
         notes=options.notes,
-        calibration=checked_calibration(options.calibration),
+        calibration=_checked_calibration(options.calibration),
     )
 
 
-def checked_calibration(path: Path | None) -> Path | None:
+def _resumed_job(options: argparse.Namespace) -> Job:
+    from tactile_resonance.scan.goal import ScanGoal, resumed_run
+
+    run = resumed_run(ScanGoal(run_directory=str(options.output.resolve()), resume=True))
+    return Job(
+        run / "scene.yaml",
+        run,
+        options.robot_host,
+        resume=True,
+        real_time=options.real_time,
+        calibration=_checked_calibration(options.calibration),
+    )
+
+
+def _checked_calibration(path: Path | None) -> Path | None:
     """The file, whole; raises ``ValueError`` where it is no calibration."""
     if path is None:
         return None
@@ -202,7 +247,6 @@ def run_job(job: Job) -> int:
             raise ValueError(text) from error
         except KeyboardInterrupt as error:
             raise KeyboardInterrupt(_way_on(job)) from error
-    ended.check()
     ended.at_once()  # every file of a report is whole or not there
     if result.ending is Ending.COMPLETE:  # each simulated record that counts is in the run
         shutil.rmtree(work / "records", ignore_errors=True)
@@ -240,24 +284,14 @@ def require_own_domain() -> None:
             )
 
 
-def require_packages(*packages: str) -> None:
-    """``ValueError`` where one is not installed."""
-    for package in packages:
-        if find_spec(package) is None:
-            raise ValueError(
-                f"{package} not found: this needs ROS 2, ur-rtde, python-can, rosbags and plotly; use "
-                "'make demo', or build the package with colcon in a sourced ROS 2 and source its install folder"
-            )
-
-
 class _Ended:
-    """Notes `ENDING` signals, so that they take effect only where they may: see `check` and `at_once`.
+    """Notes `ENDING` signals, so that they take effect only where `check` is called: they end nodes in order.
 
-    They end the nodes in order, even where a shell made this process ignore Ctrl-C.
+    Even where a shell made this process ignore Ctrl-C.
     """
 
     def __init__(self) -> None:
-        self._asked = self._at_once = False
+        self._asked = False
         for number in ENDING:
             signal.signal(number, self._note)
 
@@ -267,15 +301,13 @@ class _Ended:
             raise KeyboardInterrupt
 
     def at_once(self) -> None:
-        """From now on a signal ends the process at once: no node runs that would have to be ended first."""
-        self._at_once = True
+        """From now on a signal takes effect as it comes: no node runs that would have to be ended first."""
+        for number in ENDING:
+            signal.signal(number, signal.default_int_handler)
+        self.check()
 
     def _note(self, *_: object) -> None:
         self._asked = True
-        if self._at_once:
-            print("tactile_resonance: interrupted", file=sys.stderr)
-            sys.stdout.flush()
-            os._exit(INTERRUPTED)
 
 
 def node_parameters(
@@ -324,8 +356,8 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     with ScanClient(check) as client:
         client.wait_until_up(START_WITHIN_S)
         up = True
-        with _Bar() as bar:
-            result = client.scan(**goal, on_feedback=bar.show)
+        with Progress() as bar:
+            result = client.scan(**goal, on_feedback=_shown_by(bar))
         stalls = client.details("fake_hardware_node").get("simulator stalls")
     if result.ending in (Ending.REJECTED, Ending.REFUSED, Ending.LOST):
         raise ValueError(f"scan: {result.message}")
@@ -336,6 +368,24 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     if stalls:
         print(f"the simulation itself stood still for more than 10 ms: {stalls} times")
     return result
+
+
+def _shown_by(bar: Progress) -> Callable[[Scan.Feedback], None]:
+    """What shows the feedback of a scan."""
+    begun_s, waiting_for = time.monotonic(), ""
+
+    def show(feedback: Scan.Feedback) -> None:
+        nonlocal waiting_for
+        if feedback.waiting_for and feedback.waiting_for != waiting_for:
+            bar.say(f"waiting: {feedback.waiting_for}")
+        waiting_for = feedback.waiting_for
+        done, of = feedback.finished, feedback.points
+        line = f"{done} of {of} points after {time.monotonic() - begun_s:.0f} s"
+        what = f"point {feedback.point + 1}: {feedback.phase}"
+        repeated = f"{feedback.repeats} repeated" if feedback.repeats else ""
+        bar.show(what, done, of, done, line, repeated)
+
+    return show
 
 
 class Silence:
@@ -351,40 +401,3 @@ class Silence:
         self._stood_s = self._stood_s + step_s if count == self._count else 0.0
         self._count, self._looked_s = count, now_s
         return self._stood_s
-
-
-class _Bar:
-    """How far a scan is: a bar on a terminal, a line for each point elsewhere."""
-
-    def __init__(self) -> None:
-        from tqdm import tqdm
-
-        self._bar = tqdm(unit="point", file=sys.stderr, leave=False, disable=None)
-        self._begun_s, self._finished = time.monotonic(), -1
-        self._waiting_for = ""
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def show(self, feedback: Scan.Feedback) -> None:
-        """Take the feedback of the scan."""
-        bar = self._bar
-        if feedback.waiting_for and feedback.waiting_for != self._waiting_for:
-            bar.write(f"waiting: {feedback.waiting_for}", file=sys.stdout)
-        self._waiting_for = feedback.waiting_for
-        if bar.disable:
-            if feedback.finished != self._finished:
-                self._finished = feedback.finished
-                seconds = time.monotonic() - self._begun_s
-                print(f"{feedback.finished} of {feedback.points} points after {seconds:.0f} s")
-            sys.stdout.flush()
-            return
-        bar.total = feedback.points
-        bar.set_description(f"point {feedback.point + 1}: {feedback.phase}", refresh=False)
-        if feedback.repeats:
-            bar.set_postfix_str(f"{feedback.repeats} repeated", refresh=False)
-        bar.update(feedback.finished - bar.n)
-        bar.refresh()

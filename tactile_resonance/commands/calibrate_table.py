@@ -16,9 +16,9 @@ from tactile_resonance.commands.bench_scan import (
     Job,
     add_robot_host,
     node_parameters,
-    require_packages,
     take_domain,
 )
+from tactile_resonance.commands.options import require_packages
 from tactile_resonance.fields import read
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE

@@ -8,6 +8,8 @@ import dataclasses
 from importlib.util import find_spec
 from pathlib import Path
 
+from tactile_resonance.fields import require
+
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
     """Options of the command."""
@@ -30,8 +32,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print what was found; status 1 where the link does not serve."""
-    if not 0.5 <= options.seconds <= 3600:
-        raise ValueError(f"seconds: {options.seconds:g}, expected 0.5 to 3600")
+    require(0.5 <= options.seconds <= 3600, "--seconds", options.seconds, "0.5 to 3600")
     if find_spec("rtde_control") is None:
         raise ValueError("check-robot: ur_rtde is not installed: pip install 'ur-rtde>=1.6.5,<1.7'")
     from tactile_resonance.configuration import share_path

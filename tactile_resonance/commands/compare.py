@@ -8,6 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.commands.options import add_runs
 from tactile_resonance.counted import counted
 from tactile_resonance.files import csv_text, write_whole
 
@@ -31,7 +32,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Which points of one or several runs differ from the rest and from one another, at a false "
         "discovery rate, and groups of alike points, found without references; as OUTPUT.csv and OUTPUT.png.",
     )
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
+    add_runs(parser)
     parser.add_argument("--output", type=Path, required=True, metavar="OUTPUT")
     spread = parser.add_mutually_exclusive_group()
     spread.add_argument(

@@ -33,7 +33,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Listen and serve until interrupted."""
-    from tactile_resonance.commands.bench_scan import require_packages
+    from tactile_resonance.commands.options import require_packages
     from tactile_resonance.report.live_run import LiveRun
     from tactile_resonance.report.live_server import LiveServer
 
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     except InvalidNamespaceException as error:
         accepted = "a ROS namespace, of letters, digits, _ and /, without a digit at its parts' beginning"
         require(not error, "--namespace", options.namespace, accepted)
-    from tactile_resonance.nodes.live_listener import LiveListener
+    from tactile_resonance.nodes.client import LiveListener
 
     for number in ENDING:  # also where a shell began it in the background, interrupts ignored
         signal.signal(number, signal.default_int_handler)

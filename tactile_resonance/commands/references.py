@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.commands.options import add_runs
 from tactile_resonance.counted import counted
 from tactile_resonance.files import write_whole
 
@@ -95,7 +96,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_runs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
+    add_runs(parser)
     parser.add_argument(
         "--labels",
         required=True,

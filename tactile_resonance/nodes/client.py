@@ -17,12 +17,18 @@ from rclpy.action.client import ClientGoalHandle
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 
+from tactile_resonance import msg
 from tactile_resonance.client import CalibrationOutcome, ScanOutcome, TactileClient
 from tactile_resonance.nodes.goals import Goals, answer_of
+from tactile_resonance.nodes.running import NEWEST, POINT_RESULTS, RESULTS, SERIES
+from tactile_resonance.recording.messages import poles_from_message, time_from_message
 from tactile_resonance.scan.hands import NodeAway, ScanEnded
+from tactile_resonance.scan.point_result import from_message
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from tactile_resonance.report.live_run import LiveRun
 
 HANGS_S = 120.0
 """Longest wait for what takes seconds [s]: it only ends what hangs, whatever else the machine does."""
@@ -212,3 +218,41 @@ class ScanClient(NodeClient):
             refused = self.states.get(name, "").startswith(f"{status.message}: ")
             if status.level == DiagnosticStatus.ERROR or not refused:
                 self.states[name] = status.message
+
+
+class LiveListener(NodeClient):
+    """Passes on what it hears of a scan under way while it spins; publishes and asks for nothing.
+
+    Parameters
+    ----------
+    live : LiveRun
+    namespace : str
+        Of the nodes.
+    """
+
+    def __init__(self, live: LiveRun, namespace: str = "") -> None:
+        super().__init__("live_page", lambda: None)
+        self._live = live
+        self._prefix = f"{namespace.rstrip('/')}/" if namespace else ""
+
+    def join(self) -> None:
+        """Topics: what scan_node, frf_node, poles_node and contact_node publish anyway."""
+        for kind, topic, take, qos in (
+            (msg.PointResult, "point_result", self._on_result, POINT_RESULTS),
+            (msg.FRF, "frf", self._live.take_frf, NEWEST),
+            (msg.Poles, "poles", self._on_poles, RESULTS),
+            (msg.ContactState, "contact_state", self._on_state, SERIES),
+        ):
+            self._node.create_subscription(kind, f"{self._prefix}{topic}", take, qos)
+
+    def _on_result(self, message: msg.PointResult) -> None:
+        poles = poles_from_message(message.poles[0])[0] if message.poles else None
+        self._live.take_result(from_message(message), poles)
+
+    def _on_poles(self, message: msg.Poles) -> None:
+        poles, origin = poles_from_message(message)
+        self._live.take_poles(poles, origin.measurement_id, origin.label)
+
+    def _on_state(self, message: msg.ContactState) -> None:
+        time_s = 1e-9 * time_from_message(message.header.stamp)
+        self._live.take_state(time_s, message.state, message.force_n, message.message)

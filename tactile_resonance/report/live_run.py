@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scan that is going on, as its page sees it: what is heard goes in, events for the page come out.
 
-Without ROS: `nodes.live_listener` hears the topics, `live_server` sends the events.
+Without ROS: `nodes.client.LiveListener` hears the topics, `live_server` sends the events.
 """
 
 from __future__ import annotations

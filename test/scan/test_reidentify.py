@@ -190,9 +190,9 @@ def test_what_it_refuses(runs, tmp_path, capsys):
     cases = {
         "cannot be read as a run": [str(tmp_path)],
         "nowhere cannot be read as a run": [str(tmp_path / "nowhere")],
-        "output: not given": [str(run) for run in runs],
-        "output: ": [str(runs[0]), "--output", str(tmp_path / "no" / "folder")],
-        "band: 300 200": [str(runs[0]), "--band", "300", "200"],
+        "--output: got None; accepted is one name": [str(run) for run in runs],
+        "--output: got": [str(runs[0]), "--output", str(tmp_path / "no" / "folder")],
+        "--band: got [300.0, 200.0]": [str(runs[0]), "--band", "300", "200"],
         "order: 0": [str(runs[0]), "--order", "0"],
         "holds 4 excited lines": [str(runs[0]), "--band", "249", "259"],
     }

@@ -209,10 +209,10 @@ def test_ends_in_order(start_robots, number):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--host", "192.168.0.1"], "expected an address 127"),
+        (["--host", "192.168.0.1"], "accepted is an address 127"),
         (["--tissue", "granite"], "tissue"),
-        (["--priority", "100"], "priority: 100"),
-        (["--tissue", "gel12", "--can-port", "99999"], "can-port: 99999"),
+        (["--priority", "100"], "priority: got 100"),
+        (["--tissue", "gel12", "--can-port", "99999"], "can-port: got 99999"),
         (["--tissue", "gel12", "--table", *"00000", "nan"], "table: "),
         (["--tilt", "nan"], "tilt: serves only with --tissue"),
         (["--can-port", "29537"], "can-port: serves only with --tissue or --scene"),

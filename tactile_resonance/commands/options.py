@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What commands share: options, checks before any work is done, how far long work is."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from tactile_resonance.fields import require
+
+FIGURES = (".png", ".pdf", ".svg")
+
+
+def add_runs(parser: argparse.ArgumentParser) -> None:
+    """Folders of one or several runs."""
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
+
+
+def add_band(parser: argparse.ArgumentParser, default: str) -> None:
+    """The option ``--band``; None where it is not given."""
+    text = f"[Hz] of the fit; default: {default}"
+    parser.add_argument("--band", type=float, nargs=2, metavar=("LO", "HI"), help=text)
+
+
+def check_output(option: str, path: Path, endings: Sequence[str] = ()) -> None:
+    """``ValueError`` where a file cannot be written, or has another ending."""
+    parent = path.parent
+    writable = parent.is_dir() and os.access(parent, os.W_OK)
+    require(writable, option, str(path), "a file in a folder that can be written")
+    regular = not path.exists() or path.is_file()
+    require(regular, option, str(path), "a new file, or a regular one to replace")
+    right = not endings or path.suffix.lower() in endings
+    require(right, option, str(path), f"a file that ends in {', '.join(endings)}")
+
+
+def require_packages(*packages: str) -> None:
+    """``ValueError`` where one is not installed."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise ValueError(
+                f"{package} not found: this needs ROS 2, ur-rtde, python-can, rosbags and plotly; use "
+                "'make demo', or build the package with colcon in a sourced ROS 2 and source its install folder"
+            )
+
+
+class Progress:
+    """How far work is: a bar on a terminal, lines elsewhere.
+
+    Parameters
+    ----------
+    **options
+        Of ``tqdm``.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        from tqdm import tqdm
+
+        self._bar = tqdm(unit="point", file=sys.stderr, leave=False, disable=None, **options)
+        self._said: object = None
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def show(self, what: str, done: int, of: int, key: object, line: str, beside: str = "") -> None:
+        """Take how many points are done; where there is no bar, `line` is printed for each new `key`."""
+        bar = self._bar
+        if bar.disable:
+            if key != self._said:
+                self._said = key
+                print(line, flush=True)
+            return
+        if done < bar.n:
+            bar.reset(of)
+        bar.total = of
+        bar.set_postfix_str(beside, refresh=False)
+        bar.update(done - bar.n)
+        if bar.desc != f"{what}: ":
+            bar.set_description(what)
+
+    def say(self, text: str) -> None:
+        """Print a line beside the bar."""
+        self._bar.write(text, file=sys.stdout)
+        sys.stdout.flush()
