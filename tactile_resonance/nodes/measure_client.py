@@ -7,7 +7,8 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -47,6 +48,11 @@ class MeasureClient:
     ----------
     node : ManagedNode
     scan_time : ScanTime
+
+    Attributes
+    ----------
+    recorder : ScanRecorder
+        Of the scan that `listen` was called for.
     """
 
     def __init__(self, node: ManagedNode, scan_time: ScanTime) -> None:
@@ -57,17 +63,7 @@ class MeasureClient:
 
     def listen(self) -> None:
         """Hear all topics that are recorded, for one scan."""
-        self._recorder = ScanRecorder(self._node)
-
-    @property
-    def force_reason(self) -> str:
-        """Why the force of a block of the newest measurement is unknown."""
-        return self._recorder.force_reason or "no record states why"
-
-    @property
-    def distortion(self) -> tuple[BandDistortion, ...]:
-        """Of the newest measurement so far, in each band."""
-        return self._recorder.distortion
+        self.recorder = ScanRecorder(self._node)
 
     def measure(
         self,
@@ -103,11 +99,8 @@ class MeasureClient:
             sweep=design.sweep,
         )
         write_bands(goal, msg.Band, design.bands)
-        self._recorder.record_into(recording, goal.measurement_id)
-        try:
+        with self.recorder.recording(recording, goal.measurement_id):
             return self._follow(goal, enough, check, poll, held)
-        finally:
-            self._recorder.stop()
 
     def _follow(
         self,
@@ -123,8 +116,8 @@ class MeasureClient:
 
         def take_poles() -> None:
             nonlocal stopping, news_s
-            while not self._recorder.poles.empty():
-                message = self._recorder.poles.get()
+            while not self.recorder.poles.empty():
+                message = self.recorder.poles.get()
                 seen.append(message)
                 news_s = time.monotonic()
                 if stopping:
@@ -163,7 +156,7 @@ class MeasureClient:
     def _wait_for_results(self, result: Measure.Result, check: Check, poll: Poll) -> None:
         """Until every block's record, FRF and poles are in the recording, and all excitations."""
         deadline = time.monotonic() + self._time.patience_s(RESULTS_WITHIN_S)
-        while missing := self._recorder.missing(result.blocks):
+        while missing := self.recorder.missing(result.blocks):
             if time.monotonic() > deadline:
                 raise PointDisturbed(missing, "messages lost")
             try:
@@ -204,7 +197,7 @@ TOPICS = {
 
 
 class ScanRecorder:
-    """Listens to all topics; what comes while a recording is set goes into it.
+    """Listens to all topics; what comes within `recording` goes into a point's file.
 
     Attributes
     ----------
@@ -230,8 +223,9 @@ class ScanRecorder:
         for topic, recorded in TOPICS.items():
             self._listen(node, topic, recorded)
 
-    def record_into(self, recording: PointRecording, measurement_id: int) -> None:
-        """Write what comes from now on there; of measurements only this one."""
+    @contextmanager
+    def recording(self, recording: PointRecording, measurement_id: int) -> Iterator[None]:
+        """Write what comes meanwhile there; of measurements only this one."""
         with self._lock:
             self._recording, self._measurement_id = recording, measurement_id
             for kept in (self._counts, self._played, self._described, self._blocks):
@@ -239,11 +233,11 @@ class ScanRecorder:
             self.force_reason, self.distortion = "", ()
             while not self.poles.empty():
                 self.poles.get()
-
-    def stop(self) -> None:
-        """Write no more."""
-        with self._lock:
-            self._recording = None
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._recording = None
 
     def missing(self, blocks: int) -> str:
         """What has not come yet of a measurement of so many blocks; empty where all has.

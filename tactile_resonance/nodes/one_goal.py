@@ -10,7 +10,7 @@ from typing import Any
 from rclpy.action.server import ServerGoalHandle
 from std_srvs.srv import Trigger
 
-from tactile_resonance.nodes.managed_node import ManagedNode, in_thread
+from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.scan.progress import Controls, Request
 
 RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
@@ -99,12 +99,7 @@ class OneGoal:
                     result = await in_thread(self._node, lambda: work(goal, checked), "goal")
             finally:
                 self.handle = self.controls = None
-            if result.outcome == done:
-                goal.succeed()
-            elif goal.is_cancel_requested:
-                goal.canceled()
-            else:
-                goal.abort()
+            end_goal(goal, result.outcome == done)
             return result
 
         self._node.act(kind, name, serve, lambda _: self.cancel(), refusal)
@@ -112,16 +107,13 @@ class OneGoal:
     def serve_control(self, name: str, ask: Callable[[Controls], None]) -> None:
         """Service that asks something of the goal that is worked at."""
 
-        def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            controls = self.controls
-            if controls is None:
-                response.message = "no scan is running"
-                return response
-            ask(controls)
-            response.success = True
-            return response
+        def do() -> str:
+            if self.controls is None:
+                raise ValueError("no scan is running")
+            ask(self.controls)
+            return ""
 
-        self._node.serve(Trigger, name, serve)
+        self._node.serve_trigger(name, do)
 
     def cancel(self) -> None:
         """Cancel the goal that is worked at."""

@@ -10,12 +10,16 @@ from contextlib import contextmanager
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.srv import GetParameters
 from rclpy.duration import Duration
+from rclpy.parameter import parameter_value_to_python
 from rclpy.serialization import serialize_message
 
 from tactile_resonance import msg
+from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.nodes.goals import POLL_S, Poll
+from tactile_resonance.nodes.goals import POLL_S, Poll, answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.measure_client import MeasureClient
 from tactile_resonance.nodes.messages import pose_to_message
@@ -25,6 +29,7 @@ from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
 from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import poles_from_message
+from tactile_resonance.scan.clearance import TipUse
 from tactile_resonance.scan.hands import (
     Check,
     Measured,
@@ -44,6 +49,7 @@ from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.standoff import STILL_M, Standoffs
 from tactile_resonance.scan.surface import Plane
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
+from tactile_resonance.sensor import sensor_named
 
 STREAM_TOPICS = ("record", "frf", "poles")
 PLACED_WITHIN_S = 2.0
@@ -54,6 +60,13 @@ NOT_MOVED = "the tip is not moved (parameter contact is none)"
 RECORDERS = 1  # of the subscribers of tcp_pose: the scan's own
 MET_WITHIN_S, MET_SIMULATED_WITHIN_S = 1.0, 10.0
 """Nodes of this package give a sign of life much sooner, those of other packages never."""
+
+# Parameters of contact_node that say how it uses the sensor: a scan checks the way with the same figures.
+TIP_GEOMETRY = ("beam_tilt_rad", "housing_below_m")
+TIP_PARAMETERS = ("standoff_m", "early_m")
+TIP_LIMITS = ("depth_m", "near_m", "misalignment_rad", "clearance_m")
+TIP_NAMES = (*TIP_GEOMETRY, *(f"contact.{n}" for n in TIP_PARAMETERS), *(f"limits.{n}" for n in TIP_LIMITS))
+ANSWERED_WITHIN_S = 5.0
 
 
 class NodeHands:
@@ -98,6 +111,7 @@ class NodeHands:
         self._tip: TipContact | None = None
         if with_robot:
             self._tip = TipContact(node, scan_time, self._end_if_hung)
+            self._parameters = node.client_of(GetParameters, "contact_node/get_parameters")
         else:
             self._pose = node.publish_on(PoseStamped, "tcp_pose", PLACES)
 
@@ -207,7 +221,8 @@ class NodeHands:
         if last is None:
             raise PointFailed("measurement: it ended before its first block")
         measured = self._measured(last)
-        contact, reason = measured.origin.contact, self._measure.force_reason
+        contact = measured.origin.contact
+        reason = self._measure.recorder.force_reason or "no record states why"
         if touching and math.isnan(contact.force_n):
             raise PointDisturbed(f"force unknown: {reason}", "force unknown")
         if contact.position_m is None:
@@ -215,6 +230,23 @@ class NodeHands:
             text = f"measurement: the place of the tip is unknown: {reason}"
             raise PointDisturbed(text, "place unknown")
         return measured
+
+    def tip_use(self, sensor: str) -> TipUse | None:
+        """Use of a sensor of ``config/sensors``; None where no contact_node of ours answers in time."""
+        answer = answer_of(self._parameters, GetParameters.Request(names=TIP_NAMES), ANSWERED_WITHIN_S)
+        if answer is None:
+            return None
+        told = [parameter_value_to_python(value) for value in answer.values]
+        if len(told) != len(TIP_NAMES) or None in told:
+            return None
+        values = dict(zip((name.rpartition(".")[2] for name in TIP_NAMES), told, strict=True))
+        described = sensor_named(sensor)
+        ball, beam = described.tip.radius_m, described.beam.free_length_m
+        return TipUse(
+            TipGeometry(ball, beam, **{name: values[name] for name in TIP_GEOMETRY}),
+            ContactParameters(**{name: values[name] for name in TIP_PARAMETERS}),
+            Limits(**{name: values[name] for name in TIP_LIMITS}),
+        )
 
     def offers_tests(self) -> bool:
         """Whether a node offers the action `indent`."""
@@ -262,7 +294,7 @@ class NodeHands:
         poles, origin = poles_from_message(message)
         touched_ns = None if self._tip is None else self._tip.touched_ns
         age_s = math.nan if touched_ns is None else (origin.time_ns - touched_ns) * 1e-9
-        return Measured(poles, origin, age_s, self._measure.distortion)
+        return Measured(poles, origin, age_s, self._measure.recorder.distortion)
 
     def _poll_of(self, topics: list[str]) -> Poll:
         """Raises `NodeAway` where a node behind these topics is not at work any more."""

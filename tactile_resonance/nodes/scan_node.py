@@ -29,7 +29,6 @@ from tactile_resonance.nodes.scan_messages import (
 )
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.table_calibration import calibrate
-from tactile_resonance.nodes.tip_use import TipUseClient
 from tactile_resonance.scan.goal import Frames, GoalFiles, named_frames, resumed_run
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.point_result import TOPIC
@@ -108,7 +107,6 @@ class ScanNode(ManagedNode):
         self._frames = Frames(table_frame, base_frame, pose_of(table, "table_in_base"))
         self._time = ScanTime(self.time_server, self.hung_after_s)
         robot = contact == "robot"
-        self._tip_use = TipUseClient(self) if robot else None
         self._hands = NodeHands(self, base_frame, robot, self._time, self._tell_waiting)
         broadcast_fixed(self, base_frame, {table_frame: self._frames.table_in_base})
         self._files = GoalFiles(*values(self, "run_folder", "goal_folders"))
@@ -202,7 +200,7 @@ class ScanNode(ManagedNode):
             files,
             self._hands,
             seed=seed,
-            tip_use=None if self._tip_use is None else self._tip_use.ask,
+            tip_use=self._hands.tip_use if self._hands.free_air else None,
             tell=self._tell,
             check=controls.check_cancelled,
         )

@@ -75,12 +75,11 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
     plan = [ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))]
     with RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run:
         with run.begin_point(0) as recording:
-            recorder.record_into(recording, KEY)
-            assert spin_until(executor, bench._touch._truths.get_subscription_count)
-            if not late:
-                tell(bench, TRUTHS)
-            assert spin_until(executor, lambda: recorder._counts["bench/truth"] >= TRUTHS)
-            recorder.stop()
+            with recorder.recording(recording, KEY):
+                assert spin_until(executor, bench._touch._truths.get_subscription_count)
+                if not late:
+                    tell(bench, TRUTHS)
+                assert spin_until(executor, lambda: recorder._counts["bench/truth"] >= TRUTHS)
             recording.finish(PointResult(0, measurement_id=KEY))
         (result,) = run.content.latest
         messages = read_messages_of_type(file_of(run.path, result), POLES_TYPE)
@@ -115,17 +114,16 @@ def test_a_measurement_is_complete_with_all_of_its_excitations(nodes, tmp_path):
         RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run,
         run.begin_point(0) as recording,
     ):
-        recorder.record_into(recording, KEY)
-        tell("excitation", excitation_id=4)
-        for excitation_id in (4, 5):  # two realisations of a block each
-            for topic in ("record", "frf", "poles"):
-                for _ in range(2):  # what comes twice is one block all the same
-                    tell(topic, excitation_id=excitation_id)
-        without = "of 2 blocks came 2 records, 2 FRFs, 2 poles; excitations without a message: 1"
-        assert spin_until(executor, lambda: recorder.missing(2) == without)
-        tell("excitation", excitation_id=5)
-        assert spin_until(executor, lambda: recorder.missing(2) == "")
-        assert recorder.missing(3).startswith("of 3 blocks came 2 records")
-        assert recorder.poles.qsize() == 2
-        recorder.stop()
+        with recorder.recording(recording, KEY):
+            tell("excitation", excitation_id=4)
+            for excitation_id in (4, 5):  # two realisations of a block each
+                for topic in ("record", "frf", "poles"):
+                    for _ in range(2):  # what comes twice is one block all the same
+                        tell(topic, excitation_id=excitation_id)
+            without = "of 2 blocks came 2 records, 2 FRFs, 2 poles; excitations without a message: 1"
+            assert spin_until(executor, lambda: recorder.missing(2) == without)
+            tell("excitation", excitation_id=5)
+            assert spin_until(executor, lambda: recorder.missing(2) == "")
+            assert recorder.missing(3).startswith("of 3 blocks came 2 records")
+            assert recorder.poles.qsize() == 2
         recording.finish(PointResult(0, measurement_id=KEY))

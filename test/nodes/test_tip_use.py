@@ -13,11 +13,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.nodes import tip_use
+from tactile_resonance.nodes import scan_hands
 from tactile_resonance.nodes.contact_node import ContactNode
 from tactile_resonance.nodes.contact_parameters import read_parameters
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import initialised
+from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.processes import free_domain_id
 
 GIVEN = {"beam_tilt_rad": 0.2, "limits.depth_m": 3.5e-3, "contact.standoff_m": 4e-3}
@@ -29,13 +30,13 @@ class Asker(ManagedNode):
         super().__init__("scan_node", ())
 
     def configure(self):
-        self.tip_use = tip_use.TipUseClient(self)
+        self.hands = scan_hands.NodeHands(self, "base", True, ScanTime("", 60.0), print)
 
 
 @pytest.fixture
 def ask(monkeypatch):
     """What is told beside a node of a kind."""
-    monkeypatch.setattr(tip_use, "ANSWERED_WITHIN_S", 2.0)
+    monkeypatch.setattr(scan_hands, "ANSWERED_WITHIN_S", 2.0)
     with initialised(args=GIVEN_AS, domain_id=free_domain_id(os.environ)):
         executor, made = SingleThreadedExecutor(), []
 
@@ -43,7 +44,7 @@ def ask(monkeypatch):
             made.extend([Asker(), make()])
             made[0].trigger_configure()
             told = []
-            thread = threading.Thread(target=lambda: told.append(made[0].tip_use.ask("bimorph")))
+            thread = threading.Thread(target=lambda: told.append(made[0].hands.tip_use("bimorph")))
             for node in made:
                 executor.add_node(node)
             thread.start()
@@ -62,9 +63,9 @@ def test_figures_are_those_of_contact_node(ask):
     assert use.tip == TipGeometry(beam_tilt_rad=0.2)
     assert use.limits.depth_m == 3.5e-3
     assert use.parameters.standoff_m == 4e-3
-    for name in tip_use.LIMITS:
+    for name in scan_hands.TIP_LIMITS:
         assert getattr(use.limits, name) == getattr(limits, name)
-    for name in tip_use.PARAMETERS:
+    for name in scan_hands.TIP_PARAMETERS:
         assert getattr(use.parameters, name) == getattr(parameters, name)
 
 
