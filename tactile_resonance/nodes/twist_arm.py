@@ -250,69 +250,69 @@ class TwistArm:
 
     def _fail(self, fault: ArmFault, text: str) -> None:
         """Command zero, and raise a fault that stays."""
+        self._give_up(fault, text)
+        raise self._fault
+
+    def _give_up(self, fault: ArmFault, text: str) -> None:
         with self._lock:
             if self._fault is None:
                 self._fault = ArmError(fault, text)
             self._twist, self._moving = REST, False
         self._send()
-        raise self._fault
 
     def _watch_commands(self) -> None:
         """Whether commands come often enough; also called while the loop hangs, by a timer."""
         with self._lock:
-            gap_s = 0.0
+            gap_s, most_s = 0.0, self.config.max_command_gap_s
             if self._moving and self._commanded_ns is not None:
                 gap_s = (self.clock.now_ns() - self._commanded_ns) * 1e-9
-            if gap_s <= self.config.max_command_gap_s:
-                return
-            if self._fault is None:
-                text = f"no command for {1e3 * gap_s:.0f} ms while the tip moved, accepted are "
-                text += f"{1e3 * self.config.max_command_gap_s:g} ms"
-                self._fault = ArmError(ArmFault.LATE, text)
-            self._twist, self._moving = REST, False
-        self._send()
+        if gap_s > most_s:
+            text = f"no command for {1e3 * gap_s:.0f} ms while the tip moved, accepted are "
+            self._give_up(ArmFault.LATE, f"{text}{1e3 * most_s:g} ms")
 
     # topics
 
     def _on_pose(self, message: PoseStamped) -> None:
-        """Take a pose, in the listener's thread."""
-        try:
-            self._take(message)
-        except ArmError:  # raised again by `state`
-            return
-
-    def _take(self, message: PoseStamped) -> None:
+        """Take a pose, in the listener's thread; a fault is raised by the next `state`."""
         if self._fault is not None:
             return
-        topic, header = self.config.pose_topic, message.header
-        stamp_ns = time_from_message(header.stamp)
-        if header.frame_id != self._base_frame:
-            text = f"poses on {topic} are in {header.frame_id!r}, accepted is {self._base_frame!r}"
-            self._fail(ArmFault.INVALID, text)
+        if text := self._contradiction(message):
+            self._give_up(ArmFault.INVALID, text)
+            return
+        place, quaternion = message.pose.position, message.pose.orientation
+        turn = turn_from_quaternion(quaternion.x, quaternion.y, quaternion.z, quaternion.w)
+        a, b, c = rotated(turn, self._offset_m)
+        tip_m = (place.x + a, place.y + b, place.z + c)
+        stamp_ns = time_from_message(message.header.stamp)
+        tool = ToolPose(
+            self.clock.own_ns(stamp_ns),
+            (place.x, place.y, place.z),
+            tip_m,
+            turn_product(turn, self._offset_turn),
+        )
+        self._tools.append(tool)
+        self._arrivals.add(stamp_ns)
+
+    def _contradiction(self, message: PoseStamped) -> str:
+        """Why a pose cannot be taken; empty where it can."""
+        topic, frame = self.config.pose_topic, message.header.frame_id
+        if frame != self._base_frame:
+            return f"poses on {topic} are in {frame!r}, accepted is {self._base_frame!r}"
+        stamp_ns = time_from_message(message.header.stamp)
         time_ns = self.clock.own_ns(stamp_ns)
         early_s = (time_ns - self.clock.now_ns()) * 1e-9
         if stamp_ns == 0 or (early_s > EARLIEST_S and not self.clock.simulated):
             text = f"the time stamp of a pose on {topic} is {early_s:.3g} s ahead, accepted are "
-            self._fail(ArmFault.INVALID, text + f"{EARLIEST_S:g} s, and not 0")
-        tools = self._tools
-        if tools and time_ns <= tools[-1].time_ns:
-            self._fail(ArmFault.INVALID, f"time stamps of poses on {topic} do not increase")
-        place, quaternion = message.pose.position, message.pose.orientation
+            return f"{text}{EARLIEST_S:g} s, and not 0"
+        if self._tools and time_ns <= self._tools[-1].time_ns:
+            return f"time stamps of poses on {topic} do not increase"
+        place, turn = message.pose.position, message.pose.orientation
         if not all(map(math.isfinite, (place.x, place.y, place.z))):
-            text = f"position on {topic}: {(place.x, place.y, place.z)}, expected finite numbers"
-            self._fail(ArmFault.INVALID, text)
-        x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
-        if not 0.99 < math.hypot(x, y, z, w) < 1.01:
-            text = f"orientation on {topic}: {(x, y, z, w)}, expected a unit quaternion"
-            self._fail(ArmFault.INVALID, text)
-        turn = turn_from_quaternion(x, y, z, w)
-        a, b, c = rotated(turn, self._offset_m)
-        tip_m = (place.x + a, place.y + b, place.z + c)
-        tool = ToolPose(
-            time_ns, (place.x, place.y, place.z), tip_m, turn_product(turn, self._offset_turn)
-        )
-        tools.append(tool)
-        self._arrivals.add(stamp_ns)
+            return f"position on {topic}: {(place.x, place.y, place.z)}, expected finite numbers"
+        if not 0.99 < math.hypot(turn.x, turn.y, turn.z, turn.w) < 1.01:
+            given = (turn.x, turn.y, turn.z, turn.w)
+            return f"orientation on {topic}: {given}, expected a unit quaternion"
+        return ""
 
     def _send(self) -> None:
         """Publish the command that holds; in lockstep the next step is answered with it."""
