@@ -19,7 +19,7 @@ from tactile_resonance.analysis import (
 )
 from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
 from tactile_resonance.calibration.validity import as_of_today
-from tactile_resonance.commands.options import FIGURES, add_band, check_output
+from tactile_resonance.commands.options import FIGURES, add_band, add_file, check_output
 from tactile_resonance.contact_analysis import ContactAnalysis, contact_content, estimate_contact
 from tactile_resonance.fields import band, require
 from tactile_resonance.files import write_whole
@@ -69,7 +69,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--measurement", type=int, metavar="ID", help="which one of a folder with several"
     )
     parser.add_argument(
-        "--point", type=int, metavar="N", help="of a run in place of --measurement: its point N, from 1"
+        "--point",
+        type=int,
+        metavar="N",
+        help="of a run in place of --measurement: its point N, from 1",
     )
     parser.add_argument("--u", metavar="FIELD", help="actuator field (default: u)")
     parser.add_argument("--y", metavar="FIELD", help="sensor field (default: y)")
@@ -145,11 +148,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         action="store_true",
         help="the record was taken without drive and needs no period: name its tones (hum) and its noise level",
     )
-    parser.add_argument(
+    add_file(
+        parser,
         "--calibration",
-        type=Path,
-        metavar="FILE",
-        help="of `tactile_resonance calibrate`: stiffness of the contact, moduli and pole through this sensor; "
+        "of `tactile_resonance calibrate`: stiffness of the contact, moduli and pole through this sensor; "
         "of a run without --measurement, of all its points",
     )
     parser.add_argument(
@@ -170,8 +172,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         metavar="X",
         help="with --calibration: modulus at the mode over that under the held force (default: 1)",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result here")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it here (.png, .pdf, .svg)")
+    add_file(parser, "--json", "write the result here")
+    add_file(parser, "--plot", "draw it here (.png, .pdf, .svg)")
     parser.set_defaults(run=run)
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.calibration.file import read_calibration
-from tactile_resonance.commands.options import Progress, require_packages
+from tactile_resonance.commands.options import Progress, add_file, require_packages
 from tactile_resonance.counted import counted
 from tactile_resonance.fields import require
 from tactile_resonance.processes import (
@@ -125,11 +125,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_robot_host(parser)
-    parser.add_argument(
+    add_file(
+        parser,
         "--calibration",
-        type=Path,
-        metavar="FILE",
-        help="of `tactile_resonance calibrate`: poles through this sensor where the data do not contradict it",
+        "of `tactile_resonance calibrate`: poles through this sensor where the data do not contradict it",
     )
     parser.add_argument(
         "--real-time",

@@ -16,6 +16,7 @@ from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.records import CalibrationRecord, Load
 from tactile_resonance.calibration.validity import check_in_air, poles_in_air
 from tactile_resonance.cantilever import tip_mass
+from tactile_resonance.commands.options import add_file
 from tactile_resonance.fields import number, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.front import read_record
@@ -72,13 +73,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         default="bimorph",
         help="of config/sensors: its ball's radius (default: bimorph)",
     )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="write the calibration here")
-    parser.add_argument(
-        "--plot", type=Path, metavar="FILE", help="draw responses and residuals here"
-    )
-    parser.add_argument(
-        "--check", type=Path, metavar="FILE", help="compare one record in air with this calibration"
-    )
+    add_file(parser, "--output", "write the calibration here")
+    add_file(parser, "--plot", "draw responses and residuals here")
+    add_file(parser, "--check", "compare one record in air with this calibration")
     parser.add_argument(
         "--simulated",
         type=int,

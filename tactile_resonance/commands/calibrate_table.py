@@ -18,7 +18,7 @@ from tactile_resonance.commands.bench_scan import (
     node_parameters,
     take_domain,
 )
-from tactile_resonance.commands.options import require_packages
+from tactile_resonance.commands.options import add_file, require_packages
 from tactile_resonance.fields import read
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
@@ -67,12 +67,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
             option, type=float, default=default, help=f"{text} (default: {default:g})"
         )
     parser.add_argument("--sensor", default="bimorph", help="of config/sensors (default: bimorph)")
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="FILE",
-        help="new file of the result, in scan_node's run_folder",
-    )
+    add_file(parser, "--output", "new file of the result, in scan_node's run_folder")
     parser.add_argument("--namespace", default="", help="of scan_node")
     parser.add_argument(
         "--simulated",

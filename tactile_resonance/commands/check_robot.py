@@ -6,8 +6,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from importlib.util import find_spec
-from pathlib import Path
 
+from tactile_resonance.commands.options import add_file
 from tactile_resonance.fields import require
 
 
@@ -23,9 +23,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--host", help="name or address of the robot (default: the configuration's)"
     )
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="default: config/devices/ur5e.yaml"
-    )
+    add_file(parser, "--config", "default: config/devices/ur5e.yaml")
     parser.add_argument("--seconds", type=float, default=5.0, help="to watch (default: 5)")
     parser.set_defaults(run=run)
 

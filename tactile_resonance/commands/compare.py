@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_runs
+from tactile_resonance.commands.options import add_file, add_runs
 from tactile_resonance.counted import counted
 from tactile_resonance.files import csv_text, write_whole
 
@@ -35,11 +35,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add_runs(parser)
     parser.add_argument("--output", type=Path, required=True, metavar="OUTPUT")
     spread = parser.add_mutually_exclusive_group()
-    spread.add_argument(
+    add_file(
+        spread,
         "--library",
-        type=Path,
-        metavar="FILE",
-        help="of `references build`: points of a tissue scatter as those of one preparation do there "
+        "of `references build`: points of a tissue scatter as those of one preparation do there "
         "(default: by their noise alone)",
     )
     spread.add_argument(
@@ -56,11 +55,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="part of the points said to differ that do not (default: 0.05)",
     )
     parser.add_argument("--most", type=int, default=6, help="groups (default: 6)")
-    parser.add_argument(
+    add_file(
+        parser,
         "--nominal",
-        type=Path,
-        metavar="FILE",
-        help="with nominal_contact (default: that of the library, else of the runs' scenes)",
+        "with nominal_contact (default: that of the library, else of the runs' scenes)",
     )
     parser.set_defaults(run=run)
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.commands.options import add_file
 from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
 
@@ -38,8 +39,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         metavar="M",
         help="of the tissue on what is rigid: whether Hertz's force holds",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw force and model")
+    add_file(parser, "--json", "write all figures")
+    add_file(parser, "--plot", "draw force and model")
     of_files = parser.add_argument_group("files only: a run knows these")
     of_files.add_argument(
         "--protocol",
@@ -67,7 +68,9 @@ def run(options: argparse.Namespace) -> int:
     """Read, fit, print, write."""
     from tactile_resonance.mechanics.fit import check_options
 
-    check_options(options.terms, options.thickness_m)  # before a run's mechanics.csv is written anew
+    check_options(
+        options.terms, options.thickness_m
+    )  # before a run's mechanics.csv is written anew
     found = {path: list(_tests(path, options)) for path in options.paths}
     tests = [one for of_path in found.values() for one in of_path]
     if not tests:
@@ -125,7 +128,9 @@ def _read(path: Path, options: argparse.Namespace) -> IndentationRecord:
     if missing:
         raise ValueError(f"{path.name}: no {', '.join(missing)} among {', '.join(names)}")
     for name in COLUMNS:
-        require(arrays[name].dtype.kind != "c", f"{path.name}: {name}", "complex numbers", "real ones")
+        require(
+            arrays[name].dtype.kind != "c", f"{path.name}: {name}", "complex numbers", "real ones"
+        )
     stiffness = math.inf if options.rigid else options.stiffness_n_per_m
     time_s, force_n, indentation_m = (arrays[name].ravel().astype(float) for name in COLUMNS)
     return IndentationRecord(

@@ -21,6 +21,11 @@ def add_runs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
 
 
+def add_file(parser: argparse._ActionsContainer, option: str, text: str, **more: Any) -> None:
+    """An option that names a file."""
+    parser.add_argument(option, type=Path, metavar="FILE", help=text, **more)
+
+
 def add_band(parser: argparse.ArgumentParser, default: str) -> None:
     """The option ``--band``; None where it is not given."""
     text = f"[Hz] of the fit; default: {default}"

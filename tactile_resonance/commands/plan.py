@@ -7,6 +7,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.commands.options import add_file
 from tactile_resonance.counted import counted
 
 if TYPE_CHECKING:
@@ -30,9 +31,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "first point of each as planned, and its precision and blocks are printed as expected.",
     )
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file")
-    parser.add_argument(
-        "--figure", type=Path, metavar="FILE", help="draw points and lines (.png, .svg, .pdf)"
-    )
+    add_file(parser, "--figure", "draw points and lines (.png, .svg, .pdf)")
     parser.set_defaults(run=run)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_runs
+from tactile_resonance.commands.options import add_file, add_runs
 from tactile_resonance.counted import counted
 from tactile_resonance.files import write_whole
 
@@ -40,7 +40,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "classes that follow as a file for `tissue_classes` of scenes, and try them on points left out.",
     )
     _add_runs(build)
-    build.add_argument("--output", type=Path, required=True, metavar="FILE", help="the library")
+    add_file(build, "--output", "the library", required=True)
     build.add_argument(
         "--pool",
         action="store_true",
@@ -60,12 +60,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "probabilities hold.",
     )
     _add_runs(check)
-    check.add_argument(
-        "--library",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="of `references build`, or any file with tissue_classes",
+    add_file(
+        check, "--library", "of `references build`, or any file with tissue_classes", required=True
     )
     check.set_defaults(run=_check)
     for each in (build, check):
@@ -76,11 +72,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
             metavar="P",
             help="a point farther from each class than this part of its members is unknown (default: 0.01)",
         )
-        each.add_argument(
+        add_file(
+            each,
             "--nominal",
-            type=Path,
-            metavar="FILE",
-            help="with nominal_contact, to which poles are referred (default: that of the runs' scenes; "
+            "with nominal_contact, to which poles are referred (default: that of the runs' scenes; "
             "of check that of the library)",
         )
     variance = kinds.add_parser(
@@ -92,7 +87,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     _add_runs(variance)
     variance.set_defaults(run=_variance)
     for each in (build, check, variance):
-        each.add_argument("--figure", type=Path, metavar="FILE", help=".png, .svg or .pdf")
+        add_file(each, "--figure", ".png, .svg or .pdf")
 
 
 def _add_runs(parser: argparse.ArgumentParser) -> None:

@@ -7,6 +7,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from tactile_resonance.commands.options import add_file
 from tactile_resonance.files import write_whole
 
 COMPARISON = Path("comparison.html")
@@ -29,11 +30,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         metavar="RUN",
         help="folder of a run; several: a comparison",
     )
-    parser.add_argument(
+    add_file(
+        parser,
         "--output",
-        type=Path,
-        metavar="FILE",
-        help=f"of a comparison (default: {COMPARISON}); the files of one run are in its folder",
+        f"of a comparison (default: {COMPARISON}); the files of one run are in its folder",
     )
     parser.set_defaults(run=run)
 

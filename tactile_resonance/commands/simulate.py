@@ -11,9 +11,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tactile_resonance.commands.options import add_file
 from tactile_resonance.fields import number, require
 from tactile_resonance.processes import take_priority
 from tactile_resonance.simulation.cell.load_cell import LoadCell
@@ -81,9 +81,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     bench.add_argument(
         "--tissue", metavar="NAME", help="of config/tissues.yaml; puts it on the table"
     )
-    bench.add_argument(
-        "--scene", type=Path, metavar="FILE", help="in its place: a scene of config/scenes"
-    )
+    add_file(bench, "--scene", "in its place: a scene of config/scenes")
     bench.add_argument(
         "--table",
         type=float,
@@ -101,9 +99,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     bench.add_argument(
         "--rigid-tip", action="store_true", help="the ball without the sensor's beam"
     )
-    bench.add_argument(
-        "--cell", type=Path, metavar="FILE", help="load cell (default: config/load_cells/fine.yaml)"
-    )
+    add_file(bench, "--cell", "load cell (default: config/load_cells/fine.yaml)")
     bench.add_argument("--mount", choices=("table", "tool"), help="of the cell (default: table)")
     bench.add_argument("--can-port", type=int, help="its socketcand port (default: 29536)")
     parser.set_defaults(run=_simulate_ur, **BENCH_DEFAULTS)
@@ -124,12 +120,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="how it is served over TCP: as a socketcand with the bus can0, or as a serial adapter at "
         "socket://HOST:PORT (default: socketcand)",
     )
-    parser.add_argument(
-        "--cell",
-        type=Path,
-        metavar="FILE",
-        help="its scale and errors (default: config/load_cells/fine.yaml)",
-    )
+    add_file(parser, "--cell", "its scale and errors (default: config/load_cells/fine.yaml)")
     parser.add_argument("--seed", type=int, default=1, help="of its noise (default: 1)")
     parser.set_defaults(run=_simulate_cell)
 
