@@ -8,12 +8,14 @@ import math
 from collections.abc import Callable
 
 from tactile_resonance.action import Indent
+from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.indentation_record import IndentationRecorder
 from tactile_resonance.contact.interfaces import ForceInfo
-from tactile_resonance.contact.result import ContactResult
-from tactile_resonance.mechanics.indentation import BallTip
-from tactile_resonance.nodes.messages import indent_goal, indent_result, time_message
-from tactile_resonance.recording.messages import write_indentation
+from tactile_resonance.contact.law import Aim, HoldMode
+from tactile_resonance.contact.result import Cause, ContactResult
+from tactile_resonance.mechanics.indentation import BallTip, Protocol
+from tactile_resonance.nodes.messages import time_message, touch_of
+from tactile_resonance.recording.messages import PROTOCOLS, key_of, write_indentation
 
 
 class IndentConduct:
@@ -52,7 +54,21 @@ class IndentConduct:
         simulated: bool,
     ) -> None:
         self._request, self._base_frame = request, base_frame
-        self.goal, protocol = indent_goal(request, base_frame, ball.radius_m)
+        protocol = key_of(PROTOCOLS, request.protocol, "protocol")
+        for name in ("hold_s", "press_speed_m_s", "unload_speed_m_s"):
+            value = getattr(request, name)
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name}: {value}, accepted is a number, 0 or above")
+        if protocol is Protocol.INDENTATION and not request.unload_speed_m_s:
+            raise ValueError("unload_speed_m_s: 0, accepted with INDENTATION is a speed above 0")
+        hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
+        self.goal = ContactGoal(
+            touch_of(request, base_frame, ball.radius_m),
+            Aim(request.force_n, hold),
+            press_speed_m_s=request.press_speed_m_s or math.inf,
+            hold_s=request.hold_s,
+            unload_speed_m_s=request.unload_speed_m_s,
+        )
         self.recorder = IndentationRecorder(
             self.goal, protocol, ball, force.name, simulated=simulated
         )
@@ -66,7 +82,9 @@ class IndentConduct:
         ros_ns : callable
             From a time of the loop's clock [ns] to ROS time [ns].
         """
-        result = indent_result(outcome)
+        done = outcome.reached and outcome.cause is Cause.HOLD_ENDED
+        cause = Cause.NONE if done else outcome.cause
+        result = Indent.Result(done=done, cause=cause.value, message=outcome.message)
         record = result.record
         with contextlib.suppress(ValueError):  # the tissue was not touched
             write_indentation(record, self.recorder.record(outcome))

@@ -21,16 +21,13 @@ from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim, HoldMode
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.messages import (
-    PROTOCOLS,
     SPREAD,
     array_of,
     bands_from_message,
@@ -223,40 +220,12 @@ def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: floa
     """
     if request.hold not in _HOLDS:
         raise ValueError(f"hold: {request.hold}, accepted are {sorted(_HOLDS)}")
-    touch = _touch_of(request, base_frame, ball_radius_m)
+    touch = touch_of(request, base_frame, ball_radius_m)
     standoff_m = request.standoff_m or math.inf
     return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]), standoff_m)
 
 
-def indent_goal(
-    request: Indent.Goal, base_frame: str, ball_radius_m: float
-) -> tuple[ContactGoal, Protocol]:
-    """What a mechanical test asks for.
-
-    Raises
-    ------
-    ValueError
-        As `contact_goal`, or if the protocol is unknown or one of its figures is not finite or below 0.
-    """
-    protocol = key_of(PROTOCOLS, request.protocol, "protocol")
-    for name in ("hold_s", "press_speed_m_s", "unload_speed_m_s"):
-        value = getattr(request, name)
-        if not 0 <= value < math.inf:
-            raise ValueError(f"{name}: {value}, accepted is a number, 0 or above")
-    if protocol is Protocol.INDENTATION and not request.unload_speed_m_s:
-        raise ValueError("unload_speed_m_s: 0, accepted with INDENTATION is a speed above 0")
-    hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
-    goal = ContactGoal(
-        _touch_of(request, base_frame, ball_radius_m),
-        Aim(request.force_n, hold),
-        press_speed_m_s=request.press_speed_m_s or math.inf,
-        hold_s=request.hold_s,
-        unload_speed_m_s=request.unload_speed_m_s,
-    )
-    return goal, protocol
-
-
-def _touch_of(
+def touch_of(
     request: MakeContact.Goal | Indent.Goal, base_frame: str, ball_radius_m: float
 ) -> Pose:
     """Pose of the tip where the ball just touches the point that a request names."""
@@ -271,14 +240,6 @@ def _touch_of(
     given = np.array([request.normal.x, request.normal.y, request.normal.z])
     normal = given if given.any() else axes[:, 2]
     return touch_pose([point.x, point.y, point.z], normal, axes[:, 0], ball_radius_m)
-
-
-def indent_result(result: ContactResult) -> Indent.Result:
-    """What became of a mechanical test, without its record."""
-    done = result.reached and result.cause is Cause.HOLD_ENDED
-    if done:
-        return Indent.Result(done=True, cause=Cause.NONE.value, message=result.message)
-    return Indent.Result(cause=result.cause.value, message=result.message)
 
 
 def contact_result(result: ContactResult) -> MakeContact.Result:

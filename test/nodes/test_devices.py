@@ -89,3 +89,19 @@ def test_a_replay_is_on_disk_already(tmp_path):
     assert devices.open_store("", "replay", {"ROS_HOME": str(tmp_path)}) is None
     assert devices.open_store(str(tmp_path / "copy"), "replay", {}).folder == tmp_path / "copy"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_node_that_is_configured_anew_hears_each_block_of_the_bench_once():
+    """Those of a device that nobody reads any more would be kept for ever."""
+    with initialised(domain_id=free_domain_id(os.environ)):
+        node = ExcitationNode()
+
+        def heard():
+            return [s.topic_name for s in node.subscriptions if s.topic_name == "/bench/block"]
+
+        for _ in range(2):
+            node.trigger_configure()
+            assert len(heard()) == 1
+            node.trigger_cleanup()
+            assert heard() == []
+        node.destroy_node()
