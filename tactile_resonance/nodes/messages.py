@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Between objects of the core and messages: the only place that converts them in nodes.
 
-Beside it `recording.messages`, which needs no ROS, has what is recorded, and `nodes.scan_messages` what only
+Beside it `recording.messages`, which needs no ROS, has what is recorded, and `nodes.scan_actions` what only
 scan_node takes and sends: the others do not load scans.
 """
 
@@ -56,12 +56,18 @@ if TYPE_CHECKING:  # nodes without contact control do not load it
 
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
 
+# Fields of equal name in message and object.
+FRF_EQUAL = ("noise_dof", "total_dof", "periods", "realisations", "method", "message")
 FRF_OPTIONAL = (
     *("variance_noise", "variance_total"),
     *("actuator_amplitude", "sensor_variance_given_actuator"),
 )
 
 UNKNOWN_SPREAD = ForceSpread()
+CONTACT_FIGURES = (
+    *("force_n", "force_std_n", "depth_m", "stiffness_n_per_m", "surface_m", "surface_std_m"),
+    *("contact_s", "total_s", "peak_force_n"),
+)
 
 RosTime = Callable[[int], int]
 """From a time of the loop's clock [ns] to ROS time [ns]."""
@@ -107,17 +113,8 @@ def pose_to_message(contact: Contact) -> PoseStamped:
 
 def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) -> msg.FRF:
     """Message of an FRF with (F,) arrays."""
-    message = msg.FRF(
-        noise_dof=frf.noise_dof,
-        total_dof=frf.total_dof,
-        periods=frf.periods,
-        realisations=frf.realisations,
-        method=frf.method,
-        level_v=level_v,
-        saturated=saturated,
-        status=FRF_STATUS[frf.status],
-        message=frf.message,
-    )
+    equal = {name: getattr(frf, name) for name in FRF_EQUAL}
+    message = msg.FRF(level_v=level_v, saturated=saturated, status=FRF_STATUS[frf.status], **equal)
     write_origin(message, origin)
     fill(message.frequency_hz, frf.frequency_hz)
     fill_complex(message, "", frf.g)
@@ -144,17 +141,12 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
         frequency_hz=array_of(message.frequency_hz),
         g=complex_of(message, ""),
         **{name: optional(getattr(message, name)) for name in FRF_OPTIONAL},
-        noise_dof=message.noise_dof,
-        total_dof=message.total_dof,
+        **{name: getattr(message, name) for name in FRF_EQUAL},
         bins=bins[0] if bins else None,
         further_bins=bins[1:],
         bands=bands_from_message(message),
         distortion=distortion_from_message(message),
-        periods=message.periods,
-        realisations=message.realisations,
-        method=message.method,
         status=key_of(FRF_STATUS, message.status, "status"),
-        message=message.message,
     )
     return frf, origin_from_message(message)
 
@@ -247,11 +239,7 @@ def contact_result(result: ContactResult) -> MakeContact.Result:
     message = MakeContact.Result(
         reached=result.reached, cause=result.cause.value, message=result.message
     )
-    for name in (
-        *("force_n", "force_std_n", "depth_m", "stiffness_n_per_m"),
-        *("surface_m", "surface_std_m"),
-        *("contact_s", "total_s", "peak_force_n"),
-    ):
+    for name in CONTACT_FIGURES:
         value = getattr(result, name)
         setattr(message, name, math.nan if value is None else float(value))
     return message

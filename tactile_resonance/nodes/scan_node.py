@@ -19,16 +19,16 @@ from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, Manage
 from tactile_resonance.nodes.one_goal import RUNNING, OneGoal
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import POINT_RESULTS, run_node
-from tactile_resonance.nodes.scan_hands import NodeHands
-from tactile_resonance.nodes.scan_messages import (
+from tactile_resonance.nodes.scan_actions import (
+    calibrate,
     calibration_request,
     fill_scan_result,
     no_table,
     scan_feedback,
     scan_goal,
 )
+from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.nodes.table_calibration import calibrate
 from tactile_resonance.scan.goal import Frames, GoalFiles, named_frames, resumed_run
 from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.point_result import TOPIC
