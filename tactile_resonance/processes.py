@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 GRACE_S = 5.0
 ORPHAN_POLL_S = 0.05
@@ -53,11 +54,7 @@ class NodeProcesses:
     def start(
         self, node: str, parameters: Mapping[str, object] | None = None, niceness: int = 0
     ) -> None:
-        """Start ``python -m tactile_resonance.nodes.<node>`` with parameters of its own.
-
-        The node is told to end should this process die, and does not hear the terminal's Ctrl-C: this
-        process ends it in order.
-        """
+        """Start ``python -m tactile_resonance.nodes.<node>`` with parameters of its own; see `start_child`."""
         module = f"tactile_resonance.nodes.{node}"
         nice = ["nice", "-n", str(niceness)] if niceness else []
         command = [*nice, *self._prefix, sys.executable, "-m", module, "--ros-args"]
@@ -66,14 +63,7 @@ class NodeProcesses:
             command += ["-p", f"{name}:={text}"]  # what is no text as YAML
         self._log_folder.mkdir(parents=True, exist_ok=True)
         with (self._log_folder / f"{node}.log").open("wb") as log:
-            self._processes[node] = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                preexec_fn=end_with_parent if sys.platform == "linux" else None,
-            )
+            self._processes[node] = start_child(command, stdout=log)
 
     def bring_up(
         self,
@@ -216,6 +206,21 @@ def take_priority(priority: int) -> None:
             f"priority: {priority} refused ({error}); it needs Linux and an rtprio limit "
             "(/etc/security/limits.d) or root"
         ) from error
+
+
+def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen:
+    """Start a process that is told to end should this one die.
+
+    It does not hear the terminal's Ctrl-C: this process ends it in order. `options` are those of `Popen`.
+    """
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        preexec_fn=end_with_parent if sys.platform == "linux" else None,
+        **options,
+    )
 
 
 def end_with_parent() -> None:

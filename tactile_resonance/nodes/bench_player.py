@@ -20,7 +20,7 @@ from tactile_resonance.clock import ClockLostError, SimulatedClock, time_address
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
-from tactile_resonance.processes import end_with_parent, may_take_priority
+from tactile_resonance.processes import may_take_priority, start_child
 from tactile_resonance.record import Origin, Record
 from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.plant.defaults import PRIORITY, READY
@@ -64,20 +64,13 @@ class PlantChild:
     ) -> None:
         self._host = host
         pace = ["--priority", str(PRIORITY if may_take_priority(PRIORITY) else 0)]
-        self._process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
-                *("--scene", str(scene), "--seed", str(seed % 2**31), "--table"),
-                *(str(float(value)) for value in table_in_base),
-                *(["--simulated-time"] if simulated_time else pace),
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-            preexec_fn=end_with_parent if sys.platform == "linux" else None,
-        )
+        command = [
+            *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
+            *("--scene", str(scene), "--seed", str(seed % 2**31), "--table"),
+            *(str(float(value)) for value in table_in_base),
+            *(["--simulated-time"] if simulated_time else pace),
+        ]
+        self._process = start_child(command, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         deadline = time.monotonic() + START_WITHIN_S
         said = []
