@@ -159,7 +159,6 @@ class PoleMapNode(ManagedNode):
         kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
         self._old: set[str] = set()  # outputs that show less than is known
         self._shown: dict[str, Any] = {}  # messages of rosbags
-        self._repeat_from_s = 0.0
         self._pause = self.steady_timer(PUBLISH_PERIOD_S, self._on_pause_over)
         self._pause.cancel()
         self.resources.callback(self.destroy_timer, self._pause)
@@ -177,7 +176,8 @@ class PoleMapNode(ManagedNode):
         self.resources.callback(self.destroy_subscription, subscription)
         TipBroadcaster(self, *values(self, "tip_frame"))
         self.serve(Trigger, "pole_map/clear", self._on_clear)
-        self.every(REPEAT_PERIOD_S, self._repeat)
+        # the frame may be known from now on only
+        self.every(REPEAT_PERIOD_S, lambda: self._show(repeat=True))
 
     def activate(self) -> None:
         """Soon show what was heard since the configuration."""
@@ -262,53 +262,48 @@ class PoleMapNode(ManagedNode):
         self._old = set(self._publishers_of)
         self._show()
 
-    def _show(self) -> None:
-        """Publish what is new and read, at once; after the pause where something was just published."""
+    def _show(self, *, repeat: bool = False) -> None:
+        """Publish what is new and read, at once; after the pause where something was just published.
+
+        With `repeat` publish what is not new once more, dated now.
+        """
         if not (self.active and self._pause.is_canceled()):
             return
-        wanted = {
-            name for name in self._old if self._publishers_of[name].get_subscription_count() > 0
-        }
-        if wanted:
-            begun_s = time.monotonic()
-            self._publish(wanted)
-            pause_s = max(PUBLISH_PERIOD_S, (time.monotonic() - begun_s) / BUSY_SHARE)
-            self._pause.timer_period_ns = round(1e9 * pause_s)
-            self._pause.reset()
+        read = {name for name, each in self._publishers_of.items() if each.get_subscription_count()}
+        new = read & self._old
+        again = (read - new) & set(self._shown) if repeat else set()
+        if not (new or again):
+            return
+        begun_s = time.monotonic()
+        self._make(new)
+        for name in again:
+            restamp(self._shown[name], self.ros_now_ns())
+        for name in new | again:
+            self._publishers_of[name].publish(to_cdr(self._shown[name]))
+        pause_s = max(PUBLISH_PERIOD_S, (time.monotonic() - begun_s) / BUSY_SHARE)
+        self._pause.timer_period_ns = round(1e9 * pause_s)
+        self._pause.reset()
 
     def _on_pause_over(self) -> None:
         self._pause.cancel()
         self._show()
 
-    def _publish(self, wanted: set[str]) -> None:
+    def _make(self, names: set[str]) -> None:
+        """Make messages of the map as it is."""
         (probability, cells) = values(self, "ellipse_probability", "surface_cells")
-        header = header_message(self._frame_id, self.get_clock().now().nanoseconds)
+        header = header_message(self._frame_id, self.ros_now_ns())
         pole_map = self._grown.map
         scale = self._scale(pole_map, probability)
-        names = tuple(tissue.name for tissue in self._classes)
+        tissues = tuple(tissue.name for tissue in self._classes)
         makers: dict[str, Callable[[], Any]] = {
-            "": lambda: cloud_message(pole_map, names, header),
+            "": lambda: cloud_message(pole_map, tissues, header),
             "/markers": lambda: marker_message(pole_map, scale, probability, header, self._wanted),
-            "/legend": lambda: legend_message(pole_map, scale, probability, names, header),
+            "/legend": lambda: legend_message(pole_map, scale, probability, tissues, header),
             "/surface": lambda: surface_message(pole_map, cells, header),
         }
-        for name in wanted:
+        for name in names:
             self._shown[name] = makers[name]()
-            self._publishers_of[name].publish(to_cdr(self._shown[name]))
-            self._old.discard(name)
-
-    def _repeat(self) -> None:
-        """Publish what is shown once more, dated now: the frame may be known from now on only."""
-        begun_s = time.monotonic()
-        if begun_s < self._repeat_from_s:
-            return
-        now_ns = self.get_clock().now().nanoseconds
-        for name, message in self._shown.items():
-            if name not in self._old and self._publishers_of[name].get_subscription_count() > 0:
-                restamp(message, now_ns)
-                self._publishers_of[name].publish(to_cdr(message))
-        ended_s = time.monotonic()
-        self._repeat_from_s = ended_s + (ended_s - begun_s) / BUSY_SHARE
+        self._old -= names
 
     def _scale(self, pole_map: PoleMap, probability: float) -> EllipseScale:
         m_per_hz, m_per_damping = values(self, "ellipse_m_per_hz", "ellipse_m_per_damping")
