@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from lifecycle_msgs.msg import State, Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -145,15 +146,13 @@ class ManagerNode(Node):
             self._often.reset()
 
     def _advance(self, node: _Managed, moves: dict[int, int]) -> None:
-        """One step of one node: an answer taken, or a question asked."""
+        """One step of one node: a question asked, unless one is under way."""
         now_s = time.monotonic()
         if node.pending is not None:
-            if not node.pending.done():
-                node.due = bool(moves)
-                if now_s > node.deadline_s:
-                    self._drop(node)
-                return
-            self._take(node, now_s)
+            node.due = bool(moves)
+            if now_s > node.deadline_s:
+                self._drop(node)
+            return
         if not (node.get.service_is_ready() and node.change.service_is_ready()):
             node.state = State.PRIMARY_STATE_UNKNOWN
             return
@@ -176,12 +175,12 @@ class ManagerNode(Node):
         """An answer by which a node has moved, or may now, leads to a tick at once."""
         if node.pending is answer and not answer.cancelled():
             before, due, node.due = node.state, node.due, False
-            self._take(node, time.monotonic())
+            node.pending = None
+            self._take(node, answer.result(), time.monotonic())
             if due or node.state != before:
                 self._tick()
 
-    def _take(self, node: _Managed, now_s: float) -> None:
-        answer, node.pending = node.pending.result(), None
+    def _take(self, node: _Managed, answer: Any, now_s: float) -> None:
         if isinstance(answer, GetState.Response):
             state = answer.current_state.id
             if node.worked and self._wanted_up and state != State.PRIMARY_STATE_ACTIVE:
