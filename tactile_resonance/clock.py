@@ -120,7 +120,21 @@ class WallClock:
         return ros_ns - self._ros_ahead_ns
 
 
-class SimulatedClock:
+class OfRosTime:
+    """What clocks of simulated time share: it is ROS time."""
+
+    simulated = True
+
+    def ros_ns(self, time_ns: int) -> int:
+        """The same: simulated time is ROS time."""
+        return time_ns
+
+    def own_ns(self, ros_ns: int) -> int:
+        """The same."""
+        return ros_ns
+
+
+class SimulatedClock(OfRosTime):
     """Takes part in the time of a bench; for one thread, except `now_ns`, which any thread may call.
 
     Parameters
@@ -144,8 +158,6 @@ class SimulatedClock:
     ValueError
         If the address is not HOST:PORT.
     """
-
-    simulated = True
 
     def __init__(
         self,
@@ -177,14 +189,6 @@ class SimulatedClock:
     def now_ns(self) -> int:
         """Time that the bench reported last [ns]."""
         return self._now_ns
-
-    def ros_ns(self, time_ns: int) -> int:
-        """The same: simulated time is ROS time."""
-        return time_ns
-
-    def own_ns(self, ros_ns: int) -> int:
-        """The same."""
-        return ros_ns
 
     def ask_ns(self) -> int:
         """Time now [ns], asked of the bench."""

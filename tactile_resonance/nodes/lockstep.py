@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from tactile_resonance.clock import Demand
+from tactile_resonance.clock import Demand, OfRosTime
 from tactile_resonance.nodes.running import PLACES
 from tactile_resonance.recording.messages import time_from_message
 
@@ -43,7 +43,7 @@ class Arrivals:
             return self._changed.wait_for(lambda: self.newest_ns >= stamp_ns, seconds)
 
 
-class Lockstep:
+class Lockstep(OfRosTime):
     """The clock of a loop that a simulated controller leads, and that leads it (a `LoopClock`).
 
     Parameters
@@ -59,8 +59,6 @@ class Lockstep:
     while_waiting : callable
         Called every tenth of a second of this machine's time while simulated time stands.
     """
-
-    simulated = True
 
     def __init__(self, node: Node, answer: Callable[[int], None]) -> None:
         self.awaited: Sequence[Arrivals] = ()
@@ -78,14 +76,6 @@ class Lockstep:
     def now_ns(self) -> int:
         """Time of the newest step whose data are here [ns]."""
         return self._now_ns
-
-    def ros_ns(self, time_ns: int) -> int:
-        """The same: simulated time is ROS time."""
-        return time_ns
-
-    def own_ns(self, ros_ns: int) -> int:
-        """The same."""
-        return ros_ns
 
     def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
         """Answer step after step until a time is reached and its data are here."""
