@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.calibration.file import read_calibration
-from tactile_resonance.commands.options import Progress, add_file, require_packages
+from tactile_resonance.commands.options import ProgressBar, add_file, require_packages
 from tactile_resonance.counted import counted
 from tactile_resonance.fields import require
 from tactile_resonance.processes import (
@@ -355,7 +355,7 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     with ScanClient(check) as client:
         client.wait_until_up(START_WITHIN_S)
         up = True
-        with Progress() as bar:
+        with ProgressBar() as bar:
             result = client.scan(**goal, on_feedback=_shown_by(bar))
         stalls = client.details("fake_hardware_node").get("simulator stalls")
     if result.ending in (Ending.REJECTED, Ending.REFUSED, Ending.LOST):
@@ -369,7 +369,7 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     return result
 
 
-def _shown_by(bar: Progress) -> Callable[[Scan.Feedback], None]:
+def _shown_by(bar: ProgressBar) -> Callable[[Scan.Feedback], None]:
     """What shows the feedback of a scan."""
     begun_s, waiting_for = time.monotonic(), ""
 

@@ -53,7 +53,7 @@ def require_packages(*packages: str) -> None:
             )
 
 
-class Progress:
+class ProgressBar:
     """How far work is: a bar on a terminal, lines elsewhere.
 
     Parameters
@@ -68,7 +68,7 @@ class Progress:
         self._bar = tqdm(unit="point", file=sys.stderr, leave=False, disable=None, **options)
         self._said: object = None
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> ProgressBar:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -8,7 +8,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from tactile_resonance.commands.options import Progress, add_band, add_runs, check_output
+from tactile_resonance.commands.options import ProgressBar, add_band, add_runs, check_output
 from tactile_resonance.counted import counted
 from tactile_resonance.fields import band, require
 from tactile_resonance.poles.structure import ModelStructure
@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
         check_output("--output", output)
     csv, npz = (output.with_name(output.name + ending) for ending in (".csv", ".npz"))
     begun_s = time.monotonic()
-    with Progress(unit_scale=True) as bar:
+    with ProgressBar(unit_scale=True) as bar:
 
         def show(what: str, done: int, of: int) -> None:
             tenth = f"{what}: {done} of {of} points"

@@ -125,7 +125,7 @@ def test_bad_options_are_refused_in_one_line(capsys):
     from tactile_resonance import cli
 
     for options, message in (
-        (["--seed", "0"], "seed: 0, expected 1 to 2^31"),
+        (["--seed", "0"], "--seed: got 0; accepted is 1 to 2^31"),
         (["--scene", "nowhere.yaml"], "nowhere.yaml"),
         (
             ["--notes", "{tip_wetness: damp}"],

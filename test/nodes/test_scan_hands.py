@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hands of a scan: where they put the tip without a robot, what they measured, how contact_node uses the sensor."""
+"""Hands of a scan: where they put the tip without a robot, what they measured, how contact_node uses it."""
 
 import math
 import os
