@@ -31,100 +31,82 @@ def generate_launch_description():
     """Nodes and arguments; of a parameter's argument that is empty, params_file decides."""
     share = FindPackageShare(PACKAGE)
     arguments = [
-        DeclareLaunchArgument(
-            "namespace",
-            default_value="",
-            description="Namespace of all nodes, for several sensors side by side.",
-        ),
-        DeclareLaunchArgument(
+        _argument("namespace", "Namespace of all nodes, for several sensors side by side."),
+        _argument(
             "params_file",
-            default_value=PathJoinSubstitution([share, "config", "nodes.yaml"]),
-            description="Parameters of the nodes. An argument that is given wins over it.",
+            "Parameters of the nodes. An argument that is given wins over it.",
+            PathJoinSubstitution([share, "config", "nodes.yaml"]),
         ),
-        DeclareLaunchArgument(
+        _argument(
             "discovery",
-            default_value=EnvironmentVariable(DISCOVERY, default_value="LOCALHOST"),
+            f"Who finds these nodes: {DISCOVERY} for them. LOCALHOST: this machine only.",
+            EnvironmentVariable(DISCOVERY, default_value="LOCALHOST"),
             choices=["LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT"],
-            description=f"Who finds these nodes: {DISCOVERY} for them. LOCALHOST: this machine only.",
         ),
-        DeclareLaunchArgument(
+        _argument(
             "enclaves",
-            default_value="",
-            description="Security enclaves of the nodes: /tactile_resonance for those of "
+            "Security enclaves of the nodes: /tactile_resonance for those of "
             "config/security/policy.xml. Empty: none is passed.",
         ),
-        DeclareLaunchArgument(
+        _argument(
             "robot",
-            default_value="",
-            choices=["", "true", "ideal", "false"],
-            description="true (default): a robot brings the tip to the tissue. ideal: with the mock, contact "
+            "true (default): a robot brings the tip to the tissue. ideal: with the mock, contact "
             "is ideal, without a 500 Hz loop, behind the same actions and topics. false: the tip is "
             "taken to be where tcp_pose states.",
+            choices=["", "true", "ideal", "false"],
         ),
-        DeclareLaunchArgument(
+        _argument(
             "robot_ip",
-            default_value="",
-            description="Address of the robot. Several simulated ones need addresses 127.x.y.z of their own.",
+            "Address of the robot. Several simulated ones need addresses 127.x.y.z of their own.",
         ),
-        DeclareLaunchArgument(
-            "force_config",
-            default_value="",
-            description="Force source: a file of config/force or an absolute path.",
-        ),
-        DeclareLaunchArgument(
+        _argument("force_config", "Force source: a file of config/force or an absolute path."),
+        _argument(
             "table_in_base",
-            default_value="",
-            description="Frame of scenes in the robot's base: [x, y, z, rx, ry, rz], m and rotation vector, or "
+            "Frame of scenes in the robot's base: [x, y, z, rx, ry, rz], m and rotation vector, or "
             "the file of `tactile_resonance calibrate-table`.",
         ),
-        DeclareLaunchArgument(
+        _argument(
             "run_folder",
-            default_value="",
-            description="Folder that receives the runs; by default tactile_resonance/runs in $ROS_HOME.",
+            "Folder that receives the runs; by default tactile_resonance/runs in $ROS_HOME.",
         ),
-        DeclareLaunchArgument(
+        _argument(
             "table_frame",
-            default_value="",
-            description="Frame of the table, of poses and of the map; by default NAMESPACE/table.",
+            "Frame of the table, of poses and of the map; by default NAMESPACE/table.",
         ),
-        DeclareLaunchArgument(
-            "tip_frame",
-            default_value="",
-            description="Frame of the sensor's tip; by default NAMESPACE/tip.",
-        ),
-        DeclareLaunchArgument(
+        _argument("tip_frame", "Frame of the sensor's tip; by default NAMESPACE/tip."),
+        _argument(
             "static_transforms",
-            default_value="",
-            choices=["", "true", "false"],
-            description="true (default): broadcast the table in the base, sensor and tool in the tip, where "
+            "true (default): broadcast the table in the base, sensor and tool in the tip, where "
             "tf2_ros is installed. false: the stack does so, a robot description for example.",
-        ),
-        DeclareLaunchArgument(
-            "tip_transform",
-            default_value="",
             choices=["", "true", "false"],
-            description="The same of the tip in the base, from tcp_pose.",
         ),
-        DeclareLaunchArgument(
-            "base_frame",
-            default_value="",
-            description="Frame of the robot's base, that of its driver; by default base.",
+        _argument(
+            "tip_transform",
+            "The same of the tip in the base, from tcp_pose.",
+            choices=["", "true", "false"],
         ),
-        DeclareLaunchArgument(
+        _argument("base_frame", "Frame of the robot's base, that of its driver; by default base."),
+        _argument(
             "record",
-            default_value="false",
-            choices=["true", "false"],
-            description="Record all topics of the namespace for as long as this runs, with ros2 bag (MCAP), "
+            "Record all topics of the namespace for as long as this runs, with ros2 bag (MCAP), "
             "into session-DATE-TIME of the working folder. Scans record themselves, with or without it.",
-        ),
-        DeclareLaunchArgument(
-            "rviz",
-            default_value="false",
+            "false",
             choices=["true", "false"],
-            description="Start rviz2 with the view of the pole map, where it is installed.",
+        ),
+        _argument(
+            "rviz",
+            "Start rviz2 with the view of the pole map, where it is installed.",
+            "false",
+            choices=["true", "false"],
         ),
     ]
     return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
+
+
+def _argument(name, description, default="", choices=None):
+    return DeclareLaunchArgument(
+        name, default_value=default, description=description, choices=choices
+    )
 
 
 def _nodes(context):
