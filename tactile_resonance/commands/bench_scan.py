@@ -237,15 +237,15 @@ def run_job(job: Job) -> int:
         finite = [end if math.isfinite(end) else 0.0 for end in (ends.low, ends.high)]
         parameters["pole_map_node"]["boundary_f0_hz"] = finite
     computing = () if priority or not job.real_time else COMPUTING
-    with NodeProcesses(work / "log") as nodes:
-        nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
-        try:
+    try:
+        with NodeProcesses(work / "log") as nodes:
+            nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
             result = _scan(nodes, job, ended)
-        except (RuntimeError, ValueError) as error:
-            text = f"{error} (logs in {work / 'log'}){_way_on(job)}"
-            raise ValueError(text) from error
-        except KeyboardInterrupt as error:
-            raise KeyboardInterrupt(_way_on(job)) from error
+    # the nodes have ended: whether a run was begun is certain now
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"{error} (logs in {work / 'log'}){_way_on(job)}") from error
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(_way_on(job)) from error
     ended.at_once()  # every file of a report is whole or not there
     if result.ending is Ending.COMPLETE:  # each simulated record that counts is in the run
         shutil.rmtree(work / "records", ignore_errors=True)
