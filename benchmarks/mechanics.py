@@ -16,11 +16,11 @@ import numpy as np
 from scipy.stats import binom
 from tqdm import tqdm
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.mechanics.course import course_of
-from tactile_resonance.mechanics.fit import fit_indentation
+from tactile_resonance.mechanics.fit import Fit, Known, fit_indentation
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.mechanics.prony import Prony
-from tactile_resonance.mechanics.result import Fit, Known
 from tactile_resonance.report.drawing import save_figure
 from tactile_resonance.report.mechanics_figure import draw_tests
 from tactile_resonance.scan.tissue_tests import TissueTest, fitted
@@ -70,32 +70,47 @@ def truth_of(seed: int, rng: np.random.Generator) -> tuple[str, Prony]:
     return KINDS[kind], Prony(float(einf), einf * rng.uniform(0.2, 1.2, terms), times)
 
 
-def record_of(truth: Prony, rng: np.random.Generator) -> tuple[IndentationRecord, float, float]:
-    """Relaxation with a surface that is off, a zero that drifts, and white noise; ramp and hold [s]."""
-    stiffness = (np.inf, np.inf, BEAM_N_PER_M)[rng.integers(3)]
-    ramp_s, hold_s = rng.choice([0.1, 0.2, 0.4]), rng.choice([30.0, 60.0, 180.0])
-    noise_n = rng.choice([2e-4, 5e-4, 1e-3])
-    ball = BallTip(RADIUS_M, stiffness_n_per_m=stiffness)
-    force_n = rng.uniform(0.01, 0.02)
-    pressed = (force_n / ball.factor / truth.relaxation_modulus(ramp_s / 2)) ** (2 / 3)
-    depth_m = float(pressed + 0.012 / stiffness)
+def force_over(
+    ball: BallTip, time_s: FloatArray, depth_m: FloatArray, series: Prony, turn: int | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """(N,) force and depth of the ball, of one solid; without a turn it is not drawn back."""
+    turn = len(time_s) - 1 if turn is None else turn
+    sets = [series.equilibrium_pa], [series.moduli_pa], [series.times_s]
+    force, inside = course_of(ball, np.asarray(time_s), np.asarray(depth_m), turn, *sets)
+    return force[0], inside[0]
+
+
+def relaxation(
+    series: Prony,
+    rng: np.random.Generator,
+    *,
+    stiffness_n_per_m: float = np.inf,
+    ramp_s: float = 0.2,
+    hold_s: float = 30.0,
+    noise_n: float = 2e-4,
+    force_n: float = 0.015,
+    bend_n: float = 0.015,
+) -> IndentationRecord:
+    """0.3 s above the surface, ramp, hold, half a second in air again.
+
+    About `force_n` of it; a beam is bent as by `bend_n`. The surface is off, the zero drifts, noise is white.
+    """
+    ball = BallTip(RADIUS_M, stiffness_n_per_m=stiffness_n_per_m)
+    pressed = (force_n / ball.factor / series.relaxation_modulus(ramp_s / 2)) ** (2 / 3)
+    depth_m = float(pressed + bend_n / stiffness_n_per_m)
     time = np.arange(0.0, ramp_s + hold_s, 1 / RATE_HZ)
     depth = depth_m * np.minimum(time / ramp_s, 1.0)
-    dense = int(3 * ramp_s * RATE_HZ)
-    sparse = np.unique(np.geomspace(dense, time.size - 1, 300).astype(int))
+    sparse = np.unique(np.geomspace(int(3 * ramp_s * RATE_HZ), time.size - 1, 300).astype(int))
     nodes = np.concatenate([np.arange(sparse[0]), sparse])
-    sets = [truth.equilibrium_pa], [truth.moduli_pa], [truth.times_s]
-    course = course_of(ball, time[nodes], depth[nodes], nodes.size - 1, *sets)
-    force = np.interp(time, time[nodes], course.force_n[0])
-    before = np.arange(-0.3, 0.0, 1 / RATE_HZ)
-    after = time[-1] + np.arange(0.5, 1.0, 1 / RATE_HZ)
+    force = np.interp(time, time[nodes], force_over(ball, time[nodes], depth[nodes], series)[0])
+    before, after = np.arange(-0.3, 0.0, 1 / RATE_HZ), time[-1] + np.arange(0.5, 1.0, 1 / RATE_HZ)
     times = np.concatenate([before, time, after])
     zero = 1e-4 * rng.standard_normal() + 5e-6 * rng.standard_normal() * times
     forces = np.concatenate([0 * before, force, 0 * after])
     forces = forces + zero + noise_n * rng.standard_normal(times.size)
     depths = np.concatenate([before * depth_m / ramp_s, depth, np.full(after.size, -2e-3)])
     depths = depths + 2e-5 * rng.standard_normal()
-    return IndentationRecord(Protocol.RELAXATION, times, forces, depths, ball), ramp_s, hold_s
+    return IndentationRecord(Protocol.RELAXATION, times, forces, depths, ball, simulated=True)
 
 
 def errors_of(fit: Fit, truth: Prony) -> tuple[tuple[str, float], ...]:
@@ -122,8 +137,11 @@ def case_of(seed: int) -> Case:
     """One record."""
     rng = np.random.default_rng(seed)
     kind, truth = truth_of(seed, rng)
-    test, ramp_s, hold_s = record_of(truth, rng)
-    fit = fit_indentation(test)
+    stiffness = (np.inf, np.inf, BEAM_N_PER_M)[rng.integers(3)]
+    ramp_s, hold_s = rng.choice([0.1, 0.2, 0.4]), rng.choice([30.0, 60.0, 180.0])
+    noise_n, force_n = rng.choice([2e-4, 5e-4, 1e-3]), rng.uniform(0.01, 0.02)
+    held = {"stiffness_n_per_m": stiffness, "ramp_s": ramp_s, "hold_s": hold_s, "bend_n": 0.012}
+    fit = fit_indentation(relaxation(truth, rng, **held, noise_n=noise_n, force_n=force_n))
     beyond = 0
     for term in fit.terms:
         near = truth.times_s[int(np.argmin(np.abs(np.log(truth.times_s / term.time_s))))]

@@ -67,7 +67,7 @@ print(course.compiled())
 """
     fits = """
 sys.path.insert(0, sys.argv[1])
-from made_indentations import relaxation
+from benchmarks.mechanics import relaxation
 
 solid, rng = Prony(3e3, np.array([2e3]), np.array([1.5])), np.random.default_rng(1)
 with event.install_recorder("numba:compile") as heard:
@@ -79,10 +79,9 @@ with event.install_recorder("numba:compile") as heard:
 print(len(heard.buffer))
 """
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    folder = str(ROOT / "test" / "mechanics")
     for text, wanted in ((code, lambda first: first > 0), (code + fits, lambda *all_: all_ == (0, 0))):
         done = subprocess.run(
-            [sys.executable, "-c", text, folder], env=env, capture_output=True, text=True, check=True
+            [sys.executable, "-c", text, str(ROOT)], env=env, capture_output=True, text=True, check=True
         )
         assert wanted(*map(int, done.stdout.split())), done.stdout
 

@@ -14,7 +14,6 @@ stands.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -29,21 +28,6 @@ NEWTON_STEPS = 8
 """Of a cubic that is convex where it is solved: from above Newton's method comes down to the root."""
 
 
-@dataclass(frozen=True)
-class Course:
-    """Force and depth at each node.
-
-    Attributes
-    ----------
-    force_n : (P, N) array
-    indentation_m : (P, N) array
-        Of the ball [m]; 0 before it touches. After it has let go that of the robot.
-    """
-
-    force_n: FloatArray
-    indentation_m: FloatArray
-
-
 def course_of(
     ball: BallTip,
     time_s: FloatArray,
@@ -52,8 +36,8 @@ def course_of(
     equilibrium_pa: ArrayLike,
     moduli_pa: ArrayLike,
     times_s: ArrayLike,
-) -> Course:
-    """Force that follows from the way of the robot, for P sets of constants at once.
+) -> tuple[FloatArray, FloatArray]:
+    """Force and depth that follow from the way of the robot, for P sets of constants at once.
 
     Parameters
     ----------
@@ -66,6 +50,12 @@ def course_of(
         Node after which the contact shrinks; N - 1: it never does.
     equilibrium_pa : (P,) array
     moduli_pa, times_s : (P, terms) arrays
+
+    Returns
+    -------
+    force_n : (P, N) array
+    indentation_m : (P, N) array
+        Of the ball [m]; 0 before it touches. After it has let go that of the robot.
     """
     einf = np.atleast_1d(_own(equilibrium_pa))
     moduli, times = (np.atleast_2d(_own(v)) for v in (moduli_pa, times_s))
@@ -75,7 +65,7 @@ def course_of(
     k = ball.stiffness_n_per_m
     bending = 1 / k if np.isfinite(k) else 0.0
     _press(ball.factor, bending, time, depth, turn, einf, moduli, times, force, delta)
-    return Course(force, delta)
+    return force, delta
 
 
 def _own(values: ArrayLike) -> FloatArray:

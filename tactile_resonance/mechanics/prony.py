@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance._typing import ComplexArray, FloatArray
-from tactile_resonance.fields import require
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,19 +26,6 @@ class Prony:
     equilibrium_pa: float
     moduli_pa: FloatArray
     times_s: FloatArray
-
-    def __post_init__(self) -> None:
-        einf = self.equilibrium_pa
-        require(0 <= einf < np.inf, "equilibrium_pa", einf, "a number, 0 or above")
-        moduli, times = (
-            np.atleast_1d(np.asarray(v, float)) for v in (self.moduli_pa, self.times_s)
-        )
-        good = bool(np.all((moduli >= 0) & np.isfinite(moduli)))
-        require(good, "moduli_pa", moduli.tolist(), "numbers, 0 or above")
-        good = moduli.shape == times.shape and bool(np.all((times > 0) & np.isfinite(times)))
-        require(good, "times_s", times.tolist(), f"{moduli.size} numbers above 0")
-        object.__setattr__(self, "moduli_pa", moduli)
-        object.__setattr__(self, "times_s", times)
 
     @property
     def instantaneous_pa(self) -> float:

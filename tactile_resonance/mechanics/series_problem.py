@@ -58,19 +58,16 @@ class SeriesProblem:
 
     def __init__(self, test: IndentationRecord, means: Means) -> None:
         self.ball, self.means, self._test = test.ball, means, test
-        self._nodes = _nodes(means)
-        time, depth, at, turn = self._nodes
-        self._at = at
-        self._dense = time, depth, turn
-        c, most = self.ball.factor, depth.max()
-        peak = means.force_n.max()
+        self._time, self._depth, self._at = _nodes(means)
+        c, most, peak = self.ball.factor, self._depth.max(), means.force_n.max()
         if np.isfinite(self.ball.stiffness_n_per_m):
             most = max(0.05 * most, most - peak / self.ball.stiffness_n_per_m)
         self._scale_pa = peak / (c * most**1.5)
         self._small_pa = 1e-2 * self._scale_pa
         self._tried_s = means.ramp_s / 15, 2 * means.hold_s
         free = means.free_time_s
-        self.shows_drift = bool((free < means.begin_s).any() and (free > means.end_s).any())
+        self._shows_zero = bool((free < means.begin_s).any())
+        self.shows_drift = self._shows_zero and bool((free > means.end_s).any())
 
     def solve(self, terms: int, fewer: SeriesSolution | None) -> SeriesSolution | None:
         """Best of several starts; None where none converges."""
@@ -160,26 +157,25 @@ class SeriesProblem:
         times = np.append(times_s, FAST * means.ramp_s)
         each = np.eye(times.size + 1)  # one modulus at a time
         sets = each[:, 0], each[:, 1:], np.tile(times, (times.size + 1, 1))
-        unit = course_of(rigid, means.time_s[kept], ball_m, means.turn, *sets).force_n
+        unit, _ = course_of(rigid, means.time_s[kept], ball_m, means.turn, *sets)
         weight = means.std_n[kept]
         return nnls((unit / weight).T, means.force_n[kept] / weight)
 
     def course(self, sets: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(P, N) forces and depths of the ball, at the means, of (P, unknowns)."""
         terms = (sets.shape[1] - 5) // 2
-        time, depth, turn = self._dense
         values = np.exp(sets[:, : 2 * terms + 1])
         fast = np.full((len(sets), 1), FAST * self.means.ramp_s)
-        found = course_of(
+        force_n, ball_m = course_of(
             self.ball,
-            time,
-            depth - sets[:, -3, None],
-            turn,
+            self._time,
+            self._depth - sets[:, -3, None],
+            int(self._at[self.means.turn]),
             values[:, 0],
             np.hstack([values[:, 1 : terms + 1], self._scale_pa * sets[:, -4, None]]),
             np.hstack([values[:, terms + 1 :], fast]),
         )
-        return found.force_n[:, self._at], found.indentation_m[:, self._at]
+        return force_n[:, self._at], ball_m[:, self._at]
 
     def residuals(self, x: FloatArray) -> FloatArray:
         """Of contact, free time, and what is known of surface and zero beforehand."""
@@ -188,14 +184,11 @@ class SeriesProblem:
     def _weighted(self, x: FloatArray, force: FloatArray) -> FloatArray:
         means, test = self.means, self._test
         surface, zero, drift = x[-3:]
-        at = means.time_s - self.means.begin_s
-        free = means.free_time_s - self.means.begin_s
+        at, free = means.time_s - means.begin_s, means.free_time_s - means.begin_s
         priors = []
         if not np.isnan(test.depth_std_m):
             priors.append(surface / max(test.depth_std_m, 1e-9))
-        shown = means.free_time_s
-        before = bool((shown < means.begin_s).any())
-        if not before:
+        if not self._shows_zero:
             priors.append(zero / (max(test.force_std_n, 1e-9) if test.force_std_n >= 0 else 1e-9))
         if not self.shows_drift:
             priors.append(drift * means.end_s / 1e-9)
@@ -225,11 +218,11 @@ class SeriesProblem:
         return np.stack(columns, axis=1)
 
 
-def _nodes(means: Means) -> tuple[FloatArray, FloatArray, IntArray, int]:
-    """Times and depths of the nodes, dense where the robot moves, the place of each mean, and the turn."""
+def _nodes(means: Means) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Times and depths of the nodes, dense where the robot moves, and the place of each mean."""
     time, depth = means.time_s, means.depth_m
     most = depth.max() / 40
     parts = np.maximum(1, np.ceil(np.abs(np.diff(depth)) / most)).astype(int)
     at = np.concatenate([[0], np.cumsum(parts)])
     dense = np.interp(np.arange(at[-1] + 1), at, time)
-    return dense, np.interp(dense, time, depth), at, int(at[means.turn])
+    return dense, np.interp(dense, time, depth), at

@@ -11,9 +11,8 @@ from typing import Any
 
 from tactile_resonance.fields import known
 from tactile_resonance.files import csv_text, write_whole
-from tactile_resonance.mechanics.fit import MOST_TERMS, fit_indentation
+from tactile_resonance.mechanics.fit import MOST_TERMS, Fit, fit_indentation
 from tactile_resonance.mechanics.indentation import IndentationRecord
-from tactile_resonance.mechanics.result import Fit
 from tactile_resonance.recording.messages import indentation_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import PointResult

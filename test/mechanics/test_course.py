@@ -1,21 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
+from benchmarks.mechanics import RADIUS_M, force_over
 from tactile_resonance.mechanics.course import layer_share, sphere_share
 from tactile_resonance.mechanics.indentation import BallTip
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import read_tissues
-
-sys.path.insert(0, str(Path(__file__).parent))
-from made_indentations import RADIUS_M, force_over
 
 SOLID = Prony(2e3, np.array([3e3]), np.array([0.7]))
 ELASTIC = Prony(5e3, np.array([]), np.array([]))

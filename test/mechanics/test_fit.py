@@ -1,35 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
-from tactile_resonance.mechanics.fit import fit_indentation
+from benchmarks.mechanics import RADIUS_M, errors_of, force_over, relaxation
+from tactile_resonance.mechanics.fit import Known, fit_indentation
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.mechanics.prony import Prony
-from tactile_resonance.mechanics.result import Known
 from tactile_resonance.simulation.tissue.library import read_tissues
-
-sys.path.insert(0, str(Path(__file__).parent))
-from made_indentations import RADIUS_M, force_over, relaxation
 
 STANDARD = Prony(4e3, np.array([3e3]), np.array([2.0]))
 
 
 def deviations(fit, truth):
-    """Of all that is called determined, in its own standard deviations."""
-    found = []
-    for term in fit.terms:
-        if term.known is Known.DETERMINED:
-            near = int(np.argmin(np.abs(np.log(truth.times_s / term.time_s))))
-            found.append(np.log(term.modulus_pa / truth.moduli_pa[near]) / term.modulus_std)
-            found.append(np.log(term.time_s / truth.times_s[near]) / term.time_std)
-    if fit.equilibrium_known is Known.DETERMINED:
-        found.append(np.log(fit.equilibrium_pa / truth.equilibrium_pa) / fit.equilibrium_std)
-    return found
+    """Of all constants that are called determined, in their own standard deviations."""
+    return [error for name, error in errors_of(fit, truth) if name != "E(t)"]
 
 
 @pytest.mark.parametrize("stiffness_n_per_m", [np.inf, 14.8])

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.mechanics import relaxation
 from tactile_resonance.cli import main
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
@@ -27,8 +28,6 @@ from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.tissue_tests import fits_at
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "mechanics"))
-from made_indentations import relaxation
 from page_runs import BAND_HZ, HOSTILE, scan, write_scene
 
 from browser import browser

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from benchmarks.mechanics import relaxation
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
@@ -26,9 +27,7 @@ from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.scan.tissue_tests import fits_at, fits_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "mechanics"))
 from bench_hands import Bench, scan, scene
-from made_indentations import relaxation
 
 SOLID = Prony(3e3, np.array([2e3]), np.array([1.5]))
 RELAXATION = ProtocolRequest(Protocol.RELAXATION, hold_s=8.0, points=(2,))
