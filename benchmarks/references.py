@@ -32,11 +32,14 @@ from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import POSITION_PERCENT
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
-from tactile_resonance.tissue.clusters import find_clusters
-from tactile_resonance.tissue.differences import differences_from_rest
+from tactile_resonance.tissue.comparison import differences_from_rest, find_clusters
 from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
-from tactile_resonance.tissue.spread import ReferencePoints, spreads_of, within_preparation
-from tactile_resonance.tissue.step import smallest_steps
+from tactile_resonance.tissue.spread import (
+    ReferencePoints,
+    smallest_steps,
+    spreads_of,
+    within_preparation,
+)
 from tactile_resonance.tissue.trial import Trial, call_points, reliability
 
 SCENE, NOMINAL = "config/scenes/two_gelatines.yaml", "config/scenes/inclusion_scan.yaml"

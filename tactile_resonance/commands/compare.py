@@ -73,8 +73,11 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.report.tissue_figures import draw_comparison
     from tactile_resonance.scan.labels import nominal_of, read_nominal, referred, run_names
     from tactile_resonance.scan.point_result import PointKind
-    from tactile_resonance.tissue.clusters import find_clusters
-    from tactile_resonance.tissue.differences import differences_from_rest, pairs_that_differ
+    from tactile_resonance.tissue.comparison import (
+        differences_from_rest,
+        find_clusters,
+        pairs_that_differ,
+    )
     from tactile_resonance.tissue.references import read_classes, read_sources
     from tactile_resonance.tissue.spread import within_preparation
 

@@ -106,8 +106,7 @@ def _build(options: argparse.Namespace) -> int:
     from tactile_resonance.report.tissue_figures import draw_references
     from tactile_resonance.scan.labels import nominal_of, read_nominal, reference_points
     from tactile_resonance.tissue.references import library_text
-    from tactile_resonance.tissue.spread import spreads_of
-    from tactile_resonance.tissue.step import smallest_steps
+    from tactile_resonance.tissue.spread import smallest_steps, spreads_of
     from tactile_resonance.tissue.trial import leave_out, reliability
 
     _check_level(options.unknown_level)

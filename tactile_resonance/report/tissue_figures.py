@@ -12,10 +12,8 @@ from matplotlib.figure import Figure
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.counted import counted
 from tactile_resonance.report.drawing import SIMULATED, draw_ellipse, new_figure
-from tactile_resonance.tissue.clusters import Clusters
-from tactile_resonance.tissue.differences import Differences
-from tactile_resonance.tissue.spread import ReferencePoints, TissueSpread
-from tactile_resonance.tissue.step import SmallestStep
+from tactile_resonance.tissue.comparison import Clusters, Differences
+from tactile_resonance.tissue.spread import ReferencePoints, SmallestStep, TissueSpread
 from tactile_resonance.tissue.trial import ReliabilityBin
 
 PAPER_STEP_PERCENT = 2.0

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the poles of one tissue scatter, by source, and the class that follows from it."""
+"""How the poles of one tissue scatter, by source; the class, and the smallest step, that follow from it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
@@ -17,6 +20,9 @@ from tactile_resonance.tissue.classify import TissueClass, predictive_class
 Texts = npt.NDArray[np.str_]
 LEVELS = ("preparation", "position", "repetition")
 """Sources of spread, outermost first: figure 9 of arXiv 1805.00682, without its periods."""
+_PERCENT = re.compile(r"(\d+(?:\.\d+)?)\s*%")
+# A correlation beyond is not relied on: what is left across it is rounding and chance.
+_LEAST_EIGENVALUE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +66,11 @@ class ReferencePoints:
     def where(self, chosen: BoolArray) -> ReferencePoints:
         """Those chosen."""
         return ReferencePoints(*(getattr(self, item.name)[chosen] for item in fields(self)))
+
+    @property
+    def casting(self) -> Texts:
+        """(n,) tissue and preparation in one."""
+        return np.array([f"{t}, {p}" for t, p in zip(self.tissue, self.preparation, strict=True)])
 
     def of(self, tissue: str) -> ReferencePoints:
         """Those of one tissue."""
@@ -278,3 +289,76 @@ def not_negative(matrix: FloatArray, scale: FloatArray) -> FloatArray:
     unit = np.sqrt(np.maximum(np.diag(scale), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
     return (vectors * np.maximum(values, 0)) @ vectors.T * np.outer(unit, unit)
+
+
+@dataclass(frozen=True)
+class SmallestStep:
+    """Between two tissues whose names hold their concentrations.
+
+    Attributes
+    ----------
+    first, second : str
+    from_percent, to_percent : float
+    one_block, limit : dict of str to float
+        Step that is separated [%, as the concentrations], by what scatters the points: noise alone, then with
+        one source of spread after the other. After one block, and of any number of blocks, without noise.
+    """
+
+    first: str
+    second: str
+    from_percent: float
+    to_percent: float
+    one_block: dict[str, float]
+    limit: dict[str, float]
+
+
+def percent_of(name: str) -> float | None:
+    """Concentration in a name such as ``gelatine 12 %``; None where there is none."""
+    found = _PERCENT.search(name)
+    return float(found[1]) if found else None
+
+
+def smallest_steps(
+    spreads: Sequence[TissueSpread], probability: float = 0.99
+) -> tuple[SmallestStep, ...]:
+    """Of each two tissues of neighbouring concentrations; empty where names hold fewer than two.
+
+    The two are separated when either is called wrongly with `1 - probability`: poles 2 z standard deviations
+    apart, z the normal quantile. Poles are taken as linear in the concentration between the two, and the
+    covariance as the mean of theirs. Sources that are not determined count as none.
+    """
+    named = [(percent_of(spread.name), spread) for spread in spreads]
+    known = [(percent, spread) for percent, spread in named if percent is not None]
+    known.sort(key=lambda each: each[0])
+    needed = 2 * float(special.ndtri(probability))
+    return tuple(
+        SmallestStep(
+            low.name,
+            high.name,
+            a,
+            b,
+            *(_steps(low, high, needed * (b - a), noisy) for noisy in (True, False)),
+        )
+        for (a, low), (b, high) in pairwise(known)
+        if a < b
+    )
+
+
+def _steps(low: TissueSpread, high: TissueSpread, step: float, noisy: bool) -> dict[str, float]:
+    """By what scatters, from inside to outside; `step` is that of one standard deviation between the two."""
+    parts = {"noise": (low.block + high.block) / 2 * noisy, "force": (low.force + high.force) / 2}
+    for first, second in zip(low.sources[::-1], high.sources[::-1], strict=True):
+        parts[first.name] = np.nan_to_num([first.covariance, second.covariance]).mean(axis=0)
+    total, steps, apart = np.zeros((2, 2)), {}, high.mean - low.mean
+    for name, part in parts.items():
+        total = total + part
+        steps[name] = step / _distance(apart, total) if np.diag(total).all() else 0.0
+    return steps
+
+
+def _distance(apart: FloatArray, covariance: FloatArray) -> float:
+    """Mahalanobis distance."""
+    unit = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    along = vectors.T @ (apart / unit)
+    return float(np.sqrt(np.sum(along**2 / np.maximum(values, _LEAST_EIGENVALUE))))

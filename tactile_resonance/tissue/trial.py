@@ -130,7 +130,7 @@ def call_points(
         probability.max(axis=1),
         likely,
         tail,
-        np.array([f"{t}, {p}" for t, p in zip(points.tissue, points.preparation, strict=True)]),
+        points.casting,
     )
 
 
@@ -151,17 +151,13 @@ def leave_out(
     ValueError
         If there is only one group, or no point could be called.
     """
-    key = getattr(points, by)
-    if by == "preparation":  # of a tissue
-        key = np.array([f"{t}, {p}" for t, p in zip(points.tissue, key, strict=True)])
+    key = points.casting if by == "preparation" else getattr(points, by)
     groups = np.unique(key)
     require(len(groups) > 1, f"{by}s", groups.tolist(), "two or more, to leave one out")
     trials = []
     for group in groups:
         left = key == group
-        casts = {*zip(points.tissue[left], points.preparation[left], strict=True)}
-        same = [pair in casts for pair in zip(points.tissue, points.preparation, strict=True)]
-        rest = ~(left | np.array(same))
+        rest = ~np.isin(points.casting, points.casting[left])
         if not rest.any():
             continue
         classes = [s.as_class() for s in spreads_of(points.where(rest), pool) if s.usable]

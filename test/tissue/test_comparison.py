@@ -9,10 +9,12 @@ from scipy import special, stats
 from scipy.special import logsumexp
 from tissue.reference_points import NOISE, covariance
 
-from tactile_resonance.tissue.clusters import find_clusters
-from tactile_resonance.tissue.differences import differences_from_rest, pairs_that_differ
-from tactile_resonance.tissue.spread import SpreadSource, TissueSpread
-from tactile_resonance.tissue.step import percent_of, smallest_steps
+from tactile_resonance.tissue.comparison import (
+    differences_from_rest,
+    find_clusters,
+    pairs_that_differ,
+)
+from tactile_resonance.tissue.spread import SpreadSource, TissueSpread, percent_of, smallest_steps
 
 NONE = np.zeros((2, 2))
 MEAN = np.array([254.0, 0.0336])
