@@ -42,7 +42,7 @@ COMPUTING = ("excitation_node", "frf_node", "poles_node", "pole_map_node", "scan
 NICENESS = 10
 HUNG_AFTER_S = 60.0
 """A scan_node that is silent for so long hangs; it reports each second, and watches the other nodes itself."""
-LOOK_S = 3.0  # nodes in a domain are found within this
+LOOK_S = 3.0  # where one node of a domain is found, the others are within this
 START_WITHIN_S = 300.0  # they come up in seconds; a machine with much else to do takes longer
 
 

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 HANGS_S = 120.0
 """Longest wait for what takes seconds [s]: it only ends what hangs, whatever else the machine does."""
+NOBODY_S = 15.0
+"""Where no node is found within this, the domain has none [s]."""
 SCAN_WITHIN_S = 24 * 3600.0
 CANCELLED_WITHIN_S = 130.0  # as long as a tip may take to be drawn back
 
@@ -162,15 +164,22 @@ class ScanClient(NodeClient):
         return told or "no diagnostics"
 
     def nodes_there(self, wanted: Collection[str], within_s: float) -> list[str]:
-        """Nodes of these names in this namespace, of whomever; looked for until one is found or for so long."""
-        deadline = time.monotonic() + within_s
-        found: list[str] = []
-        while not found and time.monotonic() < deadline:
+        """Nodes of these names in this namespace, of whomever.
+
+        They are looked for until one is found, or for so long after a node of any name was; a machine with much
+        else to do takes its time.
+        """
+        own, begun_s = (self._node.get_name(), self._node.get_namespace()), time.monotonic()
+        seen_s: float | None = None
+        while True:
             self.spin(0.05)
-            there = self._node.get_node_names_and_namespaces()
-            own = self._node.get_namespace()
-            found = sorted({name for name, where in there if where == own and name in wanted})
-        return found
+            there = set(self._node.get_node_names_and_namespaces()) - {own}
+            found = sorted({name for name, where in there if where == own[1] and name in wanted})
+            now_s = time.monotonic()
+            seen_s = now_s if there and seen_s is None else seen_s
+            nobody = now_s - begun_s > NOBODY_S if seen_s is None else now_s - seen_s > within_s
+            if found or nobody:
+                return found
 
     def details(self, node: str) -> dict[str, str]:
         """Figures of a node's diagnostics, as heard last."""

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A session does not begin among the nodes of another one, and does not wait for a scan_node that hangs."""
 
+from types import SimpleNamespace
+
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
@@ -11,6 +13,8 @@ import rclpy
 from tactile_resonance.commands import bench_scan
 from tactile_resonance.commands.bench_scan import Silence, require_own_domain
 from tactile_resonance.configuration import share_path
+from tactile_resonance.nodes import client as client_module
+from tactile_resonance.nodes.client import ScanClient
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import domain_is_free, free_domain_id
 
@@ -36,13 +40,41 @@ def test_a_domain_with_nodes_of_another_session_is_refused(
                 require_own_domain()
             # before anything is started, whose nodes would be among those of the other session
             monkeypatch.setattr(bench_scan, "NodeProcesses", None)
-            job = bench_scan.Job(share_path("config/scenes/demo.yaml"), tmp_path / "run", "127.0.0.1")
+            job = bench_scan.Job(
+                share_path("config/scenes/demo.yaml"), tmp_path / "run", "127.0.0.1"
+            )
             with pytest.raises(ValueError, match=r"^ROS_DOMAIN_ID: "):
                 bench_scan.run_job(job)
             assert not any(tmp_path.iterdir())
         else:
             require_own_domain()
         node.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ("seen_s", "found", "until_s"),
+    [
+        ({"scan_node": 8.0}, ["scan_node"], 8.0),
+        ({"rviz": 1.0, "scan_node": 3.0}, ["scan_node"], 3.0),
+        ({"rviz": 6.0}, [], 8.0),
+        ({}, [], client_module.NOBODY_S),
+    ],
+)
+def test_nodes_that_a_busy_machine_discovers_late_are_found(monkeypatch, seen_s, found, until_s):
+    now = [0.0]
+    client = ScanClient(lambda: None)
+    client.spin = lambda seconds: now.__setitem__(0, now[0] + seconds)
+    client._node = SimpleNamespace(
+        get_name=lambda: "scan_client",
+        get_namespace=lambda: "/",
+        get_node_names_and_namespaces=lambda: [
+            ("scan_client", "/"),
+            *((name, "/") for name, at_s in seen_s.items() if at_s <= now[0]),
+        ],
+    )
+    monkeypatch.setattr(client_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    assert client.nodes_there(["scan_node"], 2.0) == found
+    assert now[0] == pytest.approx(until_s, abs=0.15)
 
 
 def test_silence_counts_only_while_this_process_runs(monkeypatch):
