@@ -108,8 +108,8 @@ def _distortion(output: Path) -> None:
 def _variance(output: Path) -> None:
     import numpy as np
 
+    from tactile_resonance.commands.references import print_variance
     from tactile_resonance.frf.spectra import Spectrum
-    from tactile_resonance.frf.variance_analysis import analyse_variance
     from tactile_resonance.report.drawing import SIMULATED, save_figure
     from tactile_resonance.report.frf_figures import draw_variance
     from tactile_resonance.simulation.sensor.experiments import repeated_records
@@ -118,16 +118,9 @@ def _variance(output: Path) -> None:
     lines = Spectrum.of(u, y).by_period[..., harmonics]  # (..., 2, P, F)
     g = lines[..., 0, :, :] / lines[..., 1, :, :]
     frequency_hz = harmonics * rate_hz / u.shape[-1]
-    inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
     places = np.indices(g.shape[:-1]).reshape(g.ndim - 1, -1)
     groups, g = np.stack([0 * places[0], *places[:-1]], axis=1), g.reshape(-1, frequency_hz.size)
-    whole = analyse_variance(g, frequency_hz, groups)
-    band = analyse_variance(g[:, inside], frequency_hz[inside], groups)
-    for source in reversed(band.sources):
-        print(
-            f"over {source.name}: {source.rms_level_db:.1f} dB of rms |G| at {BAND_HZ[0]:g}-"
-            f"{BAND_HZ[1]:g} Hz, {source.dof} degrees of freedom"
-        )
+    whole, band = print_variance(g, frequency_hz, groups, BAND_HZ)
     title = f"Variance of the FRF by source (gelatine 12 %, {SIMULATED})"
     save_figure(draw_variance(whole, band, BAND_HZ, title), output / "variance.png")
     print(f"figure in {output}: variance.png")

@@ -14,6 +14,8 @@ from tactile_resonance.counted import counted
 from tactile_resonance.files import write_whole
 
 if TYPE_CHECKING:
+    from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
+    from tactile_resonance.frf.variance_analysis import VarianceAnalysis
     from tactile_resonance.scan.labels import LabelOf
     from tactile_resonance.scan.point_result import PointResult
     from tactile_resonance.scan.run_content import RunContent
@@ -183,8 +185,6 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _variance(options: argparse.Namespace) -> int:
-
-    from tactile_resonance.frf.variance_analysis import analyse_variance
     from tactile_resonance.report.drawing import SIMULATED, save_figure
     from tactile_resonance.report.frf_figures import draw_variance
     from tactile_resonance.scan.labels import labelled_frfs
@@ -193,10 +193,23 @@ def _variance(options: argparse.Namespace) -> int:
     runs = read_runs(options.runs)
     band_hz = scene_band(options.runs[0]).ends_hz
     g, lines_hz, groups, left_out = labelled_frfs(runs, _labels(options.labels, runs))
-    inside = (lines_hz >= band_hz[0]) & (lines_hz <= band_hz[1])
-    whole = analyse_variance(g, lines_hz, groups)
-    band = analyse_variance(g[:, inside], lines_hz[inside], groups)
     print_left_out(left_out)
+    whole, band = print_variance(g, lines_hz, groups, band_hz)
+    if options.figure:
+        title = "Variance of the FRF by source" + (f", {SIMULATED}" if _simulated(runs) else "")
+        save_figure(draw_variance(whole, band, band_hz, title), options.figure)
+    return 0
+
+
+def print_variance(
+    g: ComplexArray, frequency_hz: FloatArray, groups: IntArray, band_hz: tuple[float, float]
+) -> tuple[VarianceAnalysis, VarianceAnalysis]:
+    """Variance by source over all lines and in a band, of which it prints the sources."""
+    from tactile_resonance.frf.variance_analysis import analyse_variance
+
+    inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    whole = analyse_variance(g, frequency_hz, groups)
+    band = analyse_variance(g[:, inside], frequency_hz[inside], groups)
     for source in reversed(band.sources):
         print(
             f"over {source.name}: {source.rms_level_db:.1f} dB of rms |G| at {band_hz[0]:g}-{band_hz[1]:g} Hz, "
@@ -204,10 +217,7 @@ def _variance(options: argparse.Namespace) -> int:
             if source.dof
             else f"over {source.name}: not determined, one of each"
         )
-    if options.figure:
-        title = "Variance of the FRF by source" + (f", {SIMULATED}" if _simulated(runs) else "")
-        save_figure(draw_variance(whole, band, band_hz, title), options.figure)
-    return 0
+    return whole, band
 
 
 def _check_level(level: float) -> None:
