@@ -224,15 +224,13 @@ class Moduli:
     message: str
 
 
-def moduli(
-    estimate: TissueContact, relaxed_ratio: float = 1.0, relaxed_ratio_std: float = 0.0
-) -> Moduli:
+def moduli(estimate: TissueContact, relaxed_ratio: float = 1.0) -> Moduli:
     """Storage and loss modulus at the mode, the contact radius taken from force and stiffness.
 
     Parameters
     ----------
     estimate : TissueContact
-    relaxed_ratio, relaxed_ratio_std : float
+    relaxed_ratio : float
         Storage modulus at the mode over the modulus under the held force, which made the contact's area: 1 of
         an elastic body. Brain: about 4; gelatine: 1.4. The moduli go as one over its root.
 
@@ -260,7 +258,7 @@ def moduli(
 
     found, slope = parts(estimate.parameters), slope_of(parts, estimate.parameters)
     covariance = slope @ estimate.total_covariance @ slope.T
-    relative = np.hypot(prior.force_std_n / prior.force_n, relaxed_ratio_std / relaxed_ratio) / 2
+    relative = prior.force_std_n / prior.force_n / 2
     std = np.sqrt(np.diag(covariance) + (relative * found) ** 2)
     plane = found[0] / relaxed_ratio / (1 - POISSON_RATIO**2)
     radius = float((0.75 * prior.force_n * radius_of_tip / plane) ** (1 / 3))

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import special
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.calibration.contact import (
     ContactPrior,
     ContactStatus,
@@ -65,10 +65,12 @@ class ContactRecord:
 
     Attributes
     ----------
-    frequency_hz : (K,) float
+    bins : (K,) int
+        Multiples of the sample rate over the samples.
     y : (K,) complex
         Sensor [V], scaled by one over the samples.
-    line_hz : (F,) float
+    lines : (F,) int
+        Of them and others.
     u : (F,) complex
         Actuator [V] at the lines.
     samples : int
@@ -77,27 +79,22 @@ class ContactRecord:
         Whether the sensor was at rest at the first sample; otherwise its state there is unknown.
     """
 
-    frequency_hz: FloatArray
+    bins: IntArray
     y: ComplexArray
-    line_hz: FloatArray
+    lines: IntArray
     u: ComplexArray
     samples: int
     sample_rate_hz: float
     from_rest: bool = True
 
     @classmethod
-    def of_bins(cls, bins: BandBins) -> ContactRecord:
+    def of_bins(cls, band: BandBins) -> ContactRecord:
         """Of the bins of one realisation from rest that hold all lines that were excited."""
-        require(bins.u.shape[0] == 1, "bins", bins.u.shape, "one realisation")
-        resolution, index = bins.resolution_hz, bins.harmonics * bins.periods
-        return cls(
-            np.asarray((bins.first_bin + np.arange(bins.count)) * resolution, float),
-            bins.y[0],
-            np.asarray(index * resolution, float),
-            bins.u[0, index - bins.first_bin],
-            bins.samples_per_period * bins.periods,
-            bins.sample_rate_hz,
-        )
+        require(band.u.shape[0] == 1, "bins", band.u.shape, "one realisation")
+        bins, lines = band.first_bin + np.arange(band.count), band.harmonics * band.periods
+        samples = band.samples_per_period * band.periods
+        u = band.u[0, lines - band.first_bin]
+        return cls(bins, band.y[0], lines, u, samples, band.sample_rate_hz)
 
     @classmethod
     def of_samples(
@@ -113,32 +110,27 @@ class ContactRecord:
         """Of whole periods (P, N) of actuator and sensor [V]."""
         record = Spectrum.of(u, y)
         samples = record.periods * record.samples_per_period
-        resolution = sample_rate_hz / samples
-        index = np.asarray(harmonics) * record.periods
-        low, high = band_hz
-        first, last = np.ceil(low / resolution - 1e-9), np.floor(high / resolution + 1e-9)
-        inside = np.arange(max(1, int(first)), min(samples // 2 - 1, int(last)) + 1)
-        return cls(
-            np.asarray(inside * resolution, float),
-            record.bins[0, inside],
-            index * resolution,
-            record.bins[1, index],
-            samples,
-            sample_rate_hz,
-            from_rest,
-        )
+        lines = np.asarray(harmonics) * record.periods
+        low, high = np.array(band_hz) / (sample_rate_hz / samples)
+        first, last = int(np.ceil(low - 1e-9)), int(np.floor(high + 1e-9))
+        bins = np.arange(max(1, first), min(samples // 2 - 1, last) + 1)
+        y_at, u_at = record.bins[0, bins], record.bins[1, lines]
+        return cls(bins, y_at, lines, u_at, samples, sample_rate_hz, from_rest)
+
+    @property
+    def resolution_hz(self) -> float:
+        """Distance of neighbouring bins."""
+        return self.sample_rate_hz / self.samples
+
+    @property
+    def frequency_hz(self) -> FloatArray:
+        """(K,) of the bins."""
+        return np.asarray(self.bins * self.resolution_hz, float)
 
     @property
     def excited(self) -> BoolArray:
         """(K,) bins that are lines."""
-        return np.isin(
-            np.rint(self.frequency_hz * self.duration_s), np.rint(self.line_hz * self.duration_s)
-        )
-
-    @property
-    def duration_s(self) -> float:
-        """Of the record."""
-        return self.samples / self.sample_rate_hz
+        return np.isin(self.bins, self.lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,11 +187,9 @@ class _Fit:
         self.noise = calibration.noise_v_per_root_hz
         self._excited = record.excited
         self._s = np.asarray(2j * np.pi * record.frequency_hz, complex)  # (K,)
-        self._lines = 2j * np.pi * record.line_hz  # (F,)
-        self._u = np.zeros(record.frequency_hz.size, complex)
-        slots = np.rint(record.line_hz * record.duration_s).astype(int)
-        here = np.rint(record.frequency_hz * record.duration_s).astype(int)
-        _, into, of = np.intersect1d(here, slots, return_indices=True)
+        self._lines = 2j * np.pi * (record.lines * record.resolution_hz)  # (F,)
+        self._u = np.zeros(record.bins.size, complex)
+        _, into, of = np.intersect1d(record.bins, record.lines, return_indices=True)
         self._u[into] = record.u[of]
         self.directions = 0  # of the unknown state at the start
 

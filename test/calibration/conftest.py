@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactile_resonance.calibration.estimator import CalibratedEstimator
 from tactile_resonance.calibration.fit import Fitted, calibrate
 from tactile_resonance.calibration.model import Calibration, SensorModel
 from tactile_resonance.calibration.records import CalibrationRecord, Load
@@ -45,6 +46,11 @@ def records(bench) -> list[CalibrationRecord]:
 @pytest.fixture(scope="session")
 def fitted(records) -> Fitted:
     return calibrate(records)
+
+
+@pytest.fixture(scope="session")
+def estimated(bench, fitted) -> CalibratedEstimator:
+    return CalibratedEstimator(fitted.calibration, bench.sensor.tip.radius_m)
 
 
 @pytest.fixture(scope="session")

@@ -2,18 +2,17 @@
 """Records to contacts through the front door and the command."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.played import SKEW_S
+from calibration.played import contact_of, run_on
 
 import tactile_resonance as tr
 from benchmarks.calibrate_benches import BAND_HZ, excitation
 from tactile_resonance.calibration.file import CalibratedSensor
 from tactile_resonance.cli import main
-from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
 from tactile_resonance.simulation.sensor.bimorph import couple
-from tactile_resonance.simulation.tissue.hertz import hertz_contact
 
 FORCE_N = 0.01
 
@@ -29,9 +28,7 @@ def sensor_file(fitted, bench, tmp_path_factory):
 
 def recording_on(bench, contact, duration_s, periods, seed=1) -> tr.Recording:
     signal = excitation(duration_s)
-    effects = BenchEffects(channel_skew_s=SKEW_S)
-    run = BenchRun(bench.sensor, couple(bench.sensor, contact), seed, effects, False)
-    block = run.block(signal, periods)
+    block = run_on(bench, contact, seed).block(signal, periods)
     return tr.make_recording(
         block.actuator.volts(),
         block.sensor.volts(),
@@ -41,13 +38,9 @@ def recording_on(bench, contact, duration_s, periods, seed=1) -> tr.Recording:
     )
 
 
-def contact_on(bench, library, tissue="gel16"):
-    return hertz_contact(library[tissue], bench.sensor.tip.radius_m, bench.contact)
-
-
 @pytest.mark.parametrize(("duration_s", "periods", "rest"), [(0.02, 1, True), (0.1, 6, False)])
 def test_the_front_door_gives_the_contact(bench, library, sensor_file, duration_s, periods, rest):
-    contact = contact_on(bench, library)
+    contact = contact_of(bench, library["gel16"])
     recording = recording_on(bench, contact, duration_s, periods)
     found = tr.estimate_contact(
         recording, sensor_file, band_hz=BAND_HZ, force_n=FORCE_N, from_rest=rest
@@ -61,15 +54,13 @@ def test_the_front_door_gives_the_contact(bench, library, sensor_file, duration_
 
 
 def test_one_period_needs_a_known_start(bench, library, sensor_file):
-    recording = recording_on(bench, contact_on(bench, library), 0.02, 1)
+    recording = recording_on(bench, contact_of(bench, library["gel16"]), 0.02, 1)
     with pytest.raises(ValueError, match="periods: got 1; accepted is two periods or more, or from"):
         tr.estimate_contact(recording, sensor_file, band_hz=BAND_HZ)
 
 
 def test_a_contradicted_calibration_falls_back_and_says_so(bench, library, sensor_file):
-    from dataclasses import replace
-
-    contact = contact_on(bench, library)
+    contact = contact_of(bench, library["gel16"])
     wet = replace(contact, radiation_mass_kg=contact.radiation_mass_kg + 2e-5)
     recording = recording_on(bench, wet, 0.1, 6)
     found = tr.estimate_contact(recording, sensor_file, band_hz=BAND_HZ, force_n=FORCE_N)
@@ -82,7 +73,7 @@ def test_a_contradicted_calibration_falls_back_and_says_so(bench, library, senso
 
 
 def test_the_command_prints_and_writes_the_contact(bench, library, sensor_file, tmp_path, capsys):
-    recording = recording_on(bench, contact_on(bench, library), 0.1, 4)
+    recording = recording_on(bench, contact_of(bench, library["gel16"]), 0.1, 4)
     record, output = tmp_path / "record.npz", tmp_path / "contact.json"
     np.savez(
         record,
@@ -100,7 +91,7 @@ def test_the_command_prints_and_writes_the_contact(bench, library, sensor_file, 
     assert "moduli: storage" in text
     content = json.loads(output.read_text())
     k = complex(*content["stiffness_n_per_m"])
-    true = complex(contact_on(bench, library).dynamic_stiffness(2j * np.pi * content["at_hz"]))
+    true = complex(contact_of(bench, library["gel16"]).dynamic_stiffness(2j * np.pi * content["at_hz"]))
     assert abs(k - true) < 4 * np.sqrt(np.trace(content["stiffness_total_covariance"]))
     assert content["status"] == "ok"
     assert content["moduli"]["storage_pa"] > 1e4

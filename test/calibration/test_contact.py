@@ -5,31 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.played import SKEW_S, played
+from calibration.played import SKEW_S, contact_of, played
 
 from tactile_resonance.calibration.contact import ContactStatus, Law, moduli
 from tactile_resonance.calibration.estimator import CalibratedEstimator
 from tactile_resonance.calibration.model import SensorModel
 from tactile_resonance.poles.result import PolesStatus
-from tactile_resonance.simulation.tissue.hertz import hertz_contact
 
 LIBRARY = ("gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver", "tumour")
 FORCE_N = 0.01
 NOISELESS = {"noise": False, "quantisation": False}
 
 
-def contact_of(bench, tissue, **options):
-    return hertz_contact(tissue, bench.sensor.tip.radius_m, bench.contact, **options)
-
-
 @pytest.fixture(scope="module")
 def known(bench, given) -> CalibratedEstimator:
     return CalibratedEstimator(given, bench.sensor.tip.radius_m)
-
-
-@pytest.fixture(scope="module")
-def estimated(bench, fitted) -> CalibratedEstimator:
-    return CalibratedEstimator(fitted.calibration, bench.sensor.tip.radius_m)
 
 
 def off_of(found, bench, tissue):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.played import SKEW_S
+from calibration.played import SKEW_S, contact_of, run_on
 
 from benchmarks.calibrate_benches import BAND_HZ, excitation
 from tactile_resonance.calibration.estimator import CalibratedEstimator, calibrated_poles
@@ -15,34 +15,27 @@ from tactile_resonance.multisine import design_multisine
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import couple
 from tactile_resonance.simulation.sensor.experiments import another_sensor, true_sensor
-from tactile_resonance.simulation.tissue.hertz import hertz_contact
 
 BANDS = (PoleBand(*BAND_HZ, 2, 6),)
-
-
-@pytest.fixture(scope="module")
-def estimator(fitted, bench):
-    return CalibratedEstimator(fitted.calibration, bench.sensor.tip.radius_m)
 
 
 def frf_of(bench, contact, signal, blocks=1):
     """As frf_node makes it of the first blocks of a measurement."""
     signal = replace(signal, bands=BANDS, periods=blocks)
-    effects = BenchEffects(channel_skew_s=SKEW_S)
-    run, frf = BenchRun(bench.sensor, couple(bench.sensor, contact), 3, effects, False), MeasurementFrf(0)
+    run, frf = run_on(bench, contact, 3), MeasurementFrf(0)
     for _ in range(blocks):
         found = frf.add(run.block(signal), signal)
     return found
 
 
 @pytest.mark.parametrize("blocks", [1, 3])
-def test_blocks_of_20_ms_from_rest_give_a_pole(estimator, bench, library, blocks):
-    contact = hertz_contact(library["gel12"], bench.sensor.tip.radius_m, bench.contact)
+def test_blocks_of_20_ms_from_rest_give_a_pole(estimated, bench, library, blocks):
+    contact = contact_of(bench, library["gel12"])
     poles = calibrated_poles(
-        frf_of(bench, contact, excitation(0.02), blocks), BANDS, estimator, 0.01, 1e-4
+        frf_of(bench, contact, excitation(0.02), blocks), BANDS, estimated, 0.01, 1e-4
     )
     assert poles.status is PolesStatus.OK
     assert "calibrated sensor" in poles.method
@@ -52,25 +45,25 @@ def test_blocks_of_20_ms_from_rest_give_a_pole(estimator, bench, library, blocks
     assert poles.main.std[0] < 0.2
 
 
-def test_what_contradicts_the_sensor_is_fitted_without_it(estimator, bench, library):
-    contact = hertz_contact(library["gel12"], bench.sensor.tip.radius_m, bench.contact)
+def test_what_contradicts_the_sensor_is_fitted_without_it(estimated, bench, library):
+    contact = contact_of(bench, library["gel12"])
     wet = replace(contact, radiation_mass_kg=contact.radiation_mass_kg + 2e-5)
-    poles = calibrated_poles(frf_of(bench, wet, excitation(0.1), 3), BANDS, estimator, 0.01)
+    poles = calibrated_poles(frf_of(bench, wet, excitation(0.1), 3), BANDS, estimated, 0.01)
     assert "calibrated" not in poles.method
     assert "without the calibrated sensor: residuals contradict" in poles.message
     assert abs(poles.main.f0_hz - couple(bench.sensor, wet).mode_near(250.0).f0_hz) < 0.2
 
 
-def test_lines_outside_of_the_band_are_named(estimator, bench, library):
-    contact = hertz_contact(library["gel12"], bench.sensor.tip.radius_m, bench.contact)
+def test_lines_outside_of_the_band_are_named(estimated, bench, library):
+    contact = contact_of(bench, library["gel12"])
     wide = design_multisine(samples_per_period=5000, band_hz=(50.0, 2000.0), level_v=0.4, seed=1)
-    poles = calibrated_poles(frf_of(bench, contact, wide, 3), BANDS, estimator, 0.01)
+    poles = calibrated_poles(frf_of(bench, contact, wide, 3), BANDS, estimated, 0.01)
     assert "excited lines lie outside of the bands" in poles.message
     assert "calibrated" not in poles.method
 
 
-def test_poles_in_air_are_measured_and_not_taken_from_the_calibration(estimator, bench):
-    poles = calibrated_poles(frf_of(bench, None, excitation(0.1), 4), BANDS, estimator)
+def test_poles_in_air_are_measured_and_not_taken_from_the_calibration(estimated, bench):
+    poles = calibrated_poles(frf_of(bench, None, excitation(0.1), 4), BANDS, estimated)
     assert "calibrated sensor" not in poles.method
     assert "without the calibrated sensor" in poles.message
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.played import SKEW_S, played
+from calibration.played import SKEW_S, contact_of, played
 
 from tactile_resonance.calibration.estimator import CalibratedEstimator
 from tactile_resonance.calibration.validity import (
@@ -15,7 +15,6 @@ from tactile_resonance.calibration.validity import (
     poles_in_air,
 )
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.tissue.hertz import hertz_contact
 
 STD = np.array([0.004, 1.5e-5])
 """Of f0 relative to 250 Hz, and of the damping ratio: two periods of 0.4 s."""
@@ -93,7 +92,7 @@ def test_without_a_covariance_nothing_is_said(fitted):
 def test_a_shifted_calibration_finds_the_contact_of_the_warmer_sensor(fitted, bench, library):
     warm = with_beam(bench, piezo_modulus_pa=0.995, shim_modulus_pa=0.995)
     tissue = library["gel12"]
-    contact = hertz_contact(tissue, bench.sensor.tip.radius_m, bench.contact)
+    contact = contact_of(bench, tissue)
     record = played(warm, contact, 0.1, seed=3, periods=2, skew_s=SKEW_S)
     air = check_in_air(fitted.calibration, *measured(warm, (1, 2, 3)))
     shifted = at_shift(fitted.calibration, air.shift, air.shift_std)

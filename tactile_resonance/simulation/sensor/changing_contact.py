@@ -17,18 +17,18 @@ from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, couple
 from tactile_resonance.simulation.tissue.hertz import Tissue, contact_of_radius
 
 
-def pole_trajectory(sensors: Iterable[CoupledBimorph], *, near_hz: float = 250.0) -> ComplexArray:
+def pole_trajectory(sensors: Iterable[CoupledBimorph]) -> ComplexArray:
     """Return the pole of one resonance of each of some sensors, one after another in time [rad/s].
 
-    The resonance is that whose natural frequency is nearest to `near_hz` of the first, and then the
-    nearest to itself.
+    The resonance is that of the first whose natural frequency is nearest to 250 Hz, and then the nearest
+    to itself.
     """
     poles: list[complex] = []
     for coupled in sensors:
         if poles:
             found = min((m.pole_rad_s for m in coupled.modes), key=lambda p: abs(p - poles[-1]))
         else:
-            found = coupled.mode_near(near_hz).pole_rad_s
+            found = coupled.mode_near(250.0).pole_rad_s
         poles.append(found)
     return np.array(poles)
 
