@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -191,13 +191,6 @@ def of_group(points: ReferencePoints, group: int, castings: int = CASTINGS) -> R
     return points.where((number // CASTINGS == group) & (number % CASTINGS < castings))
 
 
-def joined(trials: Sequence[Trial]) -> Trial:
-    """Trials of different castings as one."""
-    return Trial(
-        *(np.concatenate([getattr(t, item.name) for t in trials]) for item in fields(Trial))
-    )
-
-
 def tried(points: ReferencePoints, way: Way, without: str = "") -> Trial:
     """Each library calls the castings of the next, of all tissues; `without` one of them in the library."""
     groups = 1 + int(points.preparation.astype(int).max()) // CASTINGS
@@ -207,14 +200,14 @@ def tried(points: ReferencePoints, way: Way, without: str = "") -> Trial:
         classes = way.classes(library.where(library.tissue != without))
         castings = of_group(points, (group + 1) % groups)
         trials.append(call_points(castings, classes, LEVELS[0]))
-    return joined(trials)
+    return Trial.joined(trials)
 
 
 def outside(points: ReferencePoints, strange: ReferencePoints) -> Trial:
     """Points of other tissues, each called by the next of all libraries."""
     groups = 1 + int(points.preparation.astype(int).max()) // CASTINGS
     number = np.arange(len(strange.tissue)) % groups
-    return joined(
+    return Trial.joined(
         [
             call_points(
                 strange.where(number == group),

@@ -101,7 +101,8 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
     problem = _Records(records, first.modes, free_gain=bool(loopback), free_tip=bool(loaded))
     begun = problem.solved(problem.start(first))
     # what repeats in every period, as the steps of a converter do, no variance over periods shows
-    excess = np.maximum(1.0, problem.mean_squares(begun.residual))
+    squares_of = [np.mean(part**2) for part in problem.parts(begun.residual)]
+    excess = np.maximum(1.0, squares_of)
     problem.widen(excess)
     contradiction = problem.widen_loads(begun)
     solved = problem.solved(problem.start(SensorModel.of_values(begun.values)))
@@ -193,12 +194,10 @@ class _Records:
         covariance = covariance[: values.size, : values.size] * np.outer(slope, slope)
         return _Solved(values, covariance, self.residual(x))
 
-    def mean_squares(self, residual: FloatArray) -> FloatArray:
-        """(R,) of each record's part of a residual."""
-        counts = [2 * record.frf.g.size for record in self.records]
-        ends = np.cumsum(counts)[:-1]
-        parts = np.split(residual[: sum(counts)], ends)
-        return np.array([np.mean(part**2) for part in parts])
+    def parts(self, residual: FloatArray) -> list[FloatArray]:
+        """(2, F) real and imaginary part of a residual, of each record."""
+        ends = np.cumsum([2 * record.frf.g.size for record in self.records])
+        return [part.reshape(2, -1) for part in np.split(residual, ends)[:-1]]
 
     def widen(self, excess: FloatArray) -> None:
         """Multiply the variance of each record (R,)."""
@@ -309,12 +308,11 @@ def _fitted(
     problem: _Records, solved: _Solved, excess: FloatArray, contradiction: str, has_loopback: bool
 ) -> Fitted:
     n = problem.modes
-    residuals, start, notes = [], 0, []
-    for record, wide in zip(problem.records, excess, strict=True):
-        count = record.frf.g.size
-        parts = solved.residual[start : start + 2 * count].reshape(2, count) * np.sqrt(wide / 2)
-        residuals.append(parts[0] + 1j * parts[1])
-        start += 2 * count
+    residuals, notes = [], []
+    parts = problem.parts(solved.residual)
+    for record, wide, part in zip(problem.records, excess, parts, strict=True):
+        real, imaginary = part * np.sqrt(wide / 2)
+        residuals.append(real + 1j * imaginary)
         if wide > NOTABLE:
             notes.append(
                 f"{record.name or record.load.value}: residuals are {np.sqrt(wide):.2f} times as large "

@@ -49,6 +49,11 @@ class Trial:
     tail: FloatArray
     preparation: Texts
 
+    @classmethod
+    def joined(cls, trials: Sequence[Trial]) -> Trial:
+        """The points of several."""
+        return cls(*(np.concatenate([getattr(t, f.name) for t in trials]) for f in fields(cls)))
+
     def where(self, chosen: BoolArray) -> Trial:
         """Those points alone."""
         return Trial(*(getattr(self, item.name)[chosen] for item in fields(self)))
@@ -166,8 +171,7 @@ def leave_out(
         if classes and left.any():
             trials.append(call_points(points.where(left), classes, unknown_level))
     require(bool(trials), f"{by}s", groups.tolist(), "so many that classes remain without one")
-    joined = ([getattr(t, item.name) for t in trials] for item in fields(Trial))
-    return Trial(*(np.concatenate(each) for each in joined))
+    return Trial.joined(trials)
 
 
 def reliability(trial: Trial, confidence: float = 0.95) -> tuple[ReliabilityBin, ...]:

@@ -17,7 +17,7 @@ from tactile_resonance.tissue.references import (
     read_sources,
 )
 from tactile_resonance.tissue.spread import spreads_of
-from tactile_resonance.tissue.trial import Share, call_points, leave_out, reliability
+from tactile_resonance.tissue.trial import Share, Trial, call_points, leave_out, reliability
 
 STEP = np.array([2.5, 2.5e-3])  # 2 % w/w
 TWO_GELATINES = Path("config/scenes/two_gelatines.yaml")
@@ -43,11 +43,7 @@ def test_classes_of_few_preparations_state_probabilities_and_rates_that_hold():
         trials[k] = replace(
             trial, preparation=np.array([f"{k}, {n}" for n in range(len(trial.tissue))])
         )
-    every = [
-        np.concatenate([getattr(t, name) for t in trials])
-        for name in ("tissue", "called", "known", "probability", "likely", "tail", "preparation")
-    ]
-    bins = reliability(type(trials[0])(*every), 0.9999)
+    bins = reliability(Trial.joined(trials), 0.9999)
     assert len(bins) == 7
     assert sum(each.points for each in bins) == 1800 - unknown
     assert all(each.holds for each in bins), bins

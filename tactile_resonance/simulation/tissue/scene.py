@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,14 +32,6 @@ from tactile_resonance.simulation.tissue.library import (
 )
 
 Point = tuple[float, ...]
-
-
-class Shape(Protocol):
-    """A region of space."""
-
-    def contains(self, position_m: FloatArray) -> BoolArray:
-        """Tell for positions (..., 2 or 3) [m] which lie inside, shape (...)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -112,6 +103,9 @@ class Sphere:
         position = _coordinates(position_m, 3)
         way = position - np.asarray(self.center_m)
         return np.asarray(np.einsum("...i,...i", way, way) <= self.radius_m**2)
+
+
+Shape = Disc | Box | HalfSpace | Sphere
 
 
 def _coordinates(position_m: FloatArray, count: int) -> FloatArray:
