@@ -17,7 +17,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from action_msgs.msg import GoalStatus
@@ -80,9 +80,9 @@ Poll = Callable[[], None]
 Steps = Generator[None, None, Any]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Goals:
-    """Goals of one action.
+    """Goals of one action, one at a time.
 
     Parameters
     ----------
@@ -96,6 +96,7 @@ class Goals:
     client: ActionClient
     name: str
     pause: Callable[[float], None] = time.sleep
+    _heard_s: float = field(default=-math.inf, init=False)  # feedback of the newest goal
 
     def send(
         self,
@@ -116,11 +117,17 @@ class Goals:
         ScanEnded
             If no node accepts it.
         """
+
+        def hear(message: Any) -> None:
+            self._heard_s = time.monotonic()
+            if feedback is not None:
+                feedback(message)
+
         deadline_s = time.monotonic() + TAKEN_WITHIN_S
         while time.monotonic() < deadline_s:
             check()
             if self.client.server_is_ready():
-                with contextlib.closing(offer(self.client, goal, feedback)) as steps:
+                with contextlib.closing(offer(self.client, goal, hear)) as steps:
                     handle = self._wait(steps, lambda: self._require_node(check, poll), deadline_s)
                 if handle is not None:
                     return handle
@@ -130,7 +137,7 @@ class Goals:
 
     def follow(self, handle: ClientGoalHandle, check: Check, poll: Poll) -> Any:
         """Result of a goal; where anything is raised the goal is cancelled first, and its end waited for."""
-        steps = answer_to(self.client, handle)
+        steps = answer_to(self.client, handle, lambda: self._heard_s)
         try:
             answer = self._wait(steps, lambda: self._require_node(check, poll))
             if answer is None:
@@ -202,7 +209,7 @@ def answer_of(
     return None if answer is None else answer.result()
 
 
-def offer(client: ActionClient, goal: Any, feedback: Callable[[Any], None] | None) -> Steps:
+def offer(client: ActionClient, goal: Any, feedback: Callable[[Any], None]) -> Steps:
     """Offer a goal until it is answered; the handle of one that was accepted, None of one that was refused.
 
     One that is closed before is given up: whatever accepts the goal later cancels it.
@@ -236,11 +243,12 @@ def offer(client: ActionClient, goal: Any, feedback: Callable[[Any], None] | Non
 
 
 def answer_to(
-    client: ActionClient, handle: ClientGoalHandle, heard_s: Callable[[], float] = lambda: -math.inf
+    client: ActionClient, handle: ClientGoalHandle, heard_s: Callable[[], float]
 ) -> Steps:
     """Answer to the result of a goal; None where its node has gone or does not know it.
 
-    The result is requested again where neither it nor feedback, last at `heard_s`, has come for a while.
+    The result is requested again where neither it nor feedback, last at `heard_s`, has come for a while: each
+    request is answered, and a result may be large.
     """
     answers: list[Future] = []
     asked_s, seen_s = -math.inf, time.monotonic()

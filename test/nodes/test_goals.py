@@ -55,6 +55,7 @@ class Node:
         self.ends_after_s = 0.0  # from a cancellation to the end of its goal
         self.lost_results = self.lost_cancellations = 0  # so many of the first to come
         self.asked, self.running, self.cancelled = [], [], []
+        self.requested, self.feedback = 0, None
         self.results = {}
         self._due = []
 
@@ -88,7 +89,7 @@ class Node:
         return self.up
 
     def send_goal_async(self, goal, feedback, goal_uuid):
-        answer = self.answers.get(len(self.asked), 0.0)
+        answer, self.feedback = self.answers.get(len(self.asked), 0.0), feedback
         self.asked.append(bytes(goal_uuid.uuid))
         if not isinstance(answer, Late):
             handle = self._take(goal_uuid, answer != REFUSED)
@@ -119,6 +120,7 @@ class Node:
 
     def _get_result_async(self, handle):
         goal_id = bytes(handle.goal_id.uuid)
+        self.requested += 1
         if self.lost_results:
             self.lost_results -= 1
             return self._later(LOST, None)
@@ -188,6 +190,22 @@ def test_a_result_that_is_lost_is_requested_again(taken):
     node.end(node.asked[0])
     assert goals.follow(handle, nothing, nothing) == GoalStatus.STATUS_SUCCEEDED
     assert node.now_s == pytest.approx(2 * goals_module.SILENT_S, abs=0.1)
+
+
+def test_a_result_is_requested_once_while_feedback_comes(taken):
+    node, goals = taken()
+    heard = []
+    handle = goals.send("goal", nothing, nothing, heard.append)
+    end_s = node.now_s + 4 * goals_module.SILENT_S
+
+    def poll():
+        node.feedback("so far")
+        if node.now_s > end_s and node.running:
+            node.end(node.asked[0])
+
+    assert goals.follow(handle, nothing, poll) == GoalStatus.STATUS_SUCCEEDED
+    assert node.requested == 1
+    assert set(heard) == {"so far"}
 
 
 def test_a_goal_that_is_refused_is_asked_for_again_as_another(taken):
