@@ -8,7 +8,7 @@ show a map.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,14 +26,14 @@ from tactile_resonance.scan.map_messages import (
 )
 from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 from tactile_resonance.scan.point_file import PointFileWriter, offered_qos, read_messages_of_type
-from tactile_resonance.scan.point_result import TYPE, PointResult, from_message
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap, counts
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.tissue.classify import UNKNOWN
 
 FILE = "map.mcap"
-MOST_STATES = 100
-"""So often the map is drawn, at most."""
+MOST_STATES, MOST_DRAWN = 100, 100_000
+"""So often the map is drawn, at most, and so many points all those times together would have at the end: a state
+of a map of thousands takes megabytes."""
 _PROBABILITY, _CELLS = 0.95, 40  # as of pole_map_node
 _POSE, _TF = "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
 _LATCHED = offered_qos(1, latched=True)
@@ -44,8 +44,8 @@ _TIP_FRAME = "tip"
 def write_map_recording(run: RunContent) -> Path | None:
     """Write ``map.mcap`` into the folder of a run, in place of the one that is there.
 
-    Topics are those of pole_map_node, after each point or after `MOST_STATES` of them, the surface after the
-    last; and ``/tf``, ``/tf_static``. All stamps are times of recording, so that the file stands for itself.
+    Topics are those of pole_map_node, after each point or after `MOST_STATES` of them, fewer where there are
+    thousands of points, the surface after the last; and ``/tf``, ``/tf_static``. All stamps are times of recording, so that the file stands for itself.
 
     Returns
     -------
@@ -59,35 +59,28 @@ def write_map_recording(run: RunContent) -> Path | None:
     OSError
         If it cannot be written.
     """
-    results = list(_results(run))
+    results = sorted(filter(counts, run.results), key=lambda result: result.time_ns)
     if not results:
         return None
     with TemporaryDirectory(dir=run.path, prefix=".map-") as hidden:
         writer = PointFileWriter(Path(hidden), Path(hidden) / FILE)
         frame_id = _write_frames(writer, run)
-        step = -(-len(results) // MOST_STATES)
-        last = GrowingMap(result for _, result in results).map
+        states = min(MOST_STATES, max(1, MOST_DRAWN // len(results)))
+        step = -(-len(results) // states)
+        last = GrowingMap(results).map
         names = tuple(name for name in last.classes() if name != UNKNOWN)
         wanted = _wanted(run)
         grown = GrowingMap()
-        for done, (time_ns, result) in enumerate(results, start=1):
+        for done, result in enumerate(results, start=1):
             grown.take(result)
             if (len(results) - done) % step == 0:  # the last one is among them
-                _write_map(writer, time_ns, grown.map, frame_id, names, wanted)
-        surface = surface_message(last, _CELLS, header_message(frame_id, time_ns))
-        _write(writer, "/pole_map/surface", time_ns, surface, _LATCHED)
+                _write_map(writer, result.time_ns, grown.map, frame_id, names, wanted)
+        ended_ns = results[-1].time_ns
+        surface = surface_message(last, _CELLS, header_message(frame_id, ended_ns))
+        _write(writer, "/pole_map/surface", ended_ns, surface, _LATCHED)
         writer.finish()
         os.replace(Path(hidden) / FILE, run.path / FILE)
     return run.path / FILE
-
-
-def _results(run: RunContent) -> Iterator[tuple[int, PointResult]]:
-    """Each result that changed the map, and when it was recorded [ns]."""
-    for path in run.paths_in_order:
-        for time_ns, _, message in read_messages_of_type(path, TYPE):
-            result = from_message(message)
-            if counts(result):
-                yield time_ns, result
 
 
 def _wanted(run: RunContent) -> LevelSet | None:
@@ -127,7 +120,7 @@ def _write_frames(writer: PointFileWriter, run: RunContent) -> str:
         turn = quaternion_from_vector(vector(pose.rotation_rad))
         frame = _transform(base, frame_id, start_ns, vector(pose.position_m), turn)
         _write(writer, "/tf_static", start_ns, make_message(_TF, transforms=[frame]), _LATCHED)
-    for path in run.paths_in_order:
+    for path in run.paths_with(_POSE):
         for time_ns, _, message in read_messages_of_type(path, _POSE):
             at, turn = message.pose.position, message.pose.orientation
             position, quaternion = (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)

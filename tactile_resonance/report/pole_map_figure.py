@@ -12,7 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
 from tactile_resonance.report.boundary import RunBoundary
-from tactile_resonance.report.drawing import PROBABILITY, SIMULATED, draw_ellipse, new_figure
+from tactile_resonance.report.drawing import PROBABILITY, SIMULATED, ellipse, new_figure
 from tactile_resonance.scan.level_set import PROBABILITY as LINE_PROBABILITY
 from tactile_resonance.scan.level_set import Lines
 from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, MapSurface, PoleMap
@@ -128,9 +128,12 @@ def _draw_plane(axes: Axes, pole_map: PoleMap) -> None:
         points = [p.result for p in pole_map.estimated if p.result.tissue_class == name]
         x = np.array([p.estimate for p in points])
         axes.plot(*x.T, _MARKS[k % len(_MARKS)], color=f"C{k}", ms=4, label=name or "poles")
-        for p in points:
-            if np.all(np.isfinite(p.covariance)):
-                draw_ellipse(axes, p.estimate, p.covariance, color=f"C{k}", lw=0.8)
+        loops = [
+            (p.estimate[:, None] + ellipse(p.covariance, 100)).T
+            for p in points
+            if np.all(np.isfinite(p.covariance))
+        ]
+        axes.add_collection(LineCollection(loops, colors=f"C{k}", linewidths=0.8, zorder=2))
     axes.set(xlabel="f0 [Hz]", ylabel="damping ratio")
     axes.set_title(f"measured poles, {100 * PROBABILITY:g} % ellipses", fontsize="medium")
     axes.ticklabel_format(useOffset=False)

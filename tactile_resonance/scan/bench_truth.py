@@ -54,9 +54,10 @@ def truths_of(run: RunContent, known: Container[int] = ()) -> dict[int, PointTru
     ValueError
         If a file is damaged.
     """
-    truths = {}
+    truths, told_at = {}, run.messages_at(POLES_TYPE)
     for result in run.latest:
-        if not result.simulated or result.outcome is not PointOutcome.DONE or result.index in known:
+        done = result.simulated and result.outcome is PointOutcome.DONE
+        if not done or result.index in known or result.index not in told_at:
             continue
         messages = read_messages_of_type(file_of(run.path, result), POLES_TYPE)
         told = [poles_from_message(message) for _, _, message in messages]

@@ -87,14 +87,14 @@ def marker_message(
         lines = pole_map.ellipses(scale, probability)  # (e, segments, 2, 3)
         ellipses.points = _points(lines.reshape(-1, 3))
         own = shares([point.result.f0_hz for point in pole_map.with_ellipse], pole_map.f0_hz)
-        for rgb in colours(own):
-            ellipses.colors += [_colour(rgb)] * (lines[0].size // 3)
+        ends = lines[0].size // 3
+        ellipses.colors = [each for each in _colours(colours(own)) for _ in range(ends)]
     if pole_map.failures:
         crosses.scale.x = 2 * _LINE * pole_map.size_m
         arms = np.array([[-1, -1, 0], [1, 1, 0], [-1, 1, 0], [1, -1, 0]])
-        ends = [p.position_m + 0.2 * pole_map.spacing_m * arms for p in pole_map.failures]
-        crosses.points = _points(np.array(ends).reshape(-1, 3))
-        crosses.color = _colour(_FAILED)
+        crossed = [p.position_m + 0.2 * pole_map.spacing_m * arms for p in pole_map.failures]
+        crosses.points = _points(np.array(crossed).reshape(-1, 3))
+        (crosses.color,) = _colours([_FAILED])
     markers = [ellipses, crosses, *_boundary_markers(pole_map, wanted, header)]
     return make_message(MARKERS, markers=[m if m.points else _deleted(m) for m in markers])
 
@@ -104,7 +104,7 @@ def _boundary_markers(pole_map: PoleMap, wanted: LevelSet | None, header: Messag
     if wanted is None:
         return []
     outline, band = (_marker(header, "boundary", k, "LINE_LIST") for k in range(2))
-    band.color = _colour(_WHITE, 0.5)
+    (band.color,) = _colours([_WHITE], 0.5)
     boundary = pole_map.boundary(wanted)
     if boundary is not None:
         z = float(np.median(pole_map.positions_m[:, 2]))
@@ -156,7 +156,7 @@ def legend_message(
         marker = _marker(header, "legend", len(markers), "TEXT_VIEW_FACING")
         marker.text, marker.scale.z = text, text_m
         marker.scale.x = 0.6 * text_m  # of spaces; rviz's own is for texts 1 m high
-        marker.pose.position = _point(middle_m, height_m, z)
+        (marker.pose.position,) = _points(np.array([[middle_m, height_m, z]]))
         markers.append(marker)
 
     # rviz hangs a text about its middle
@@ -221,7 +221,7 @@ def _marker(header: Message, namespace: str, number: int, kind: str) -> Message:
     marker = make_message(_MARKER, header=header, ns=namespace, id=number, frame_locked=True)
     marker.type, marker.action = getattr(marker, kind), marker.ADD
     marker.pose.orientation.w = 1.0
-    marker.color = _colour(_WHITE)
+    (marker.color,) = _colours([_WHITE])
     return marker
 
 
@@ -239,19 +239,18 @@ def _lay(marker: Message, positions_m: FloatArray, share: FloatArray, alpha: flo
     faces = np.stack([a, b, c, a, c, d], axis=-1).ravel()
     marker.scale.x = marker.scale.y = marker.scale.z = 1.0
     corners = _points(positions_m.reshape(-1, 3))
-    rgba = [_colour(rgb, alpha) for rgb in colours(share.ravel())]
+    rgba = _colours(colours(share.ravel()), alpha)
     marker.points = [corners[k] for k in faces]
     marker.colors = [rgba[k] for k in faces]
 
 
 def _points(positions: FloatArray) -> list[Message]:
-    return [_point(*place) for place in positions.tolist()]
+    """Of places (n, 3)."""
+    make = message_types().types["geometry_msgs/msg/Point"]
+    return [make(*place) for place in positions.tolist()]
 
 
-def _point(x: float, y: float, z: float) -> Message:
-    return message_types().types["geometry_msgs/msg/Point"](x, y, z)
-
-
-def _colour(rgb: npt.ArrayLike, alpha: float = 1.0) -> Message:
-    r, g, b = (float(v) for v in np.asarray(rgb))
-    return message_types().types["std_msgs/msg/ColorRGBA"](r, g, b, alpha)
+def _colours(rgb: npt.ArrayLike, alpha: float = 1.0) -> list[Message]:
+    """Of red, green and blue (n, 3)."""
+    make = message_types().types["std_msgs/msg/ColorRGBA"]
+    return [make(*each, alpha) for each in np.asarray(rgb, float).tolist()]

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -23,7 +25,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer, storage_mcap
 from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError
@@ -39,6 +41,8 @@ from tactile_resonance.scan.messages import (
 )
 
 BAG_VERSION: Literal[9] = 9
+# rosbags parses the QoS of every topic of every file anew, 2 ms each: few texts differ
+storage_mcap.get_qos = cache(storage_mcap.get_qos)
 _FOREVER = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
 
@@ -194,7 +198,12 @@ class PointFileWriter:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
-        content = read_content(written)
+        content = FileContent(
+            self._target.name,
+            self._writer.min_timestamp,
+            self._writer.max_timestamp,
+            tuple(_topic_of(c, c.digest, self._writer.counts[c.id]) for c in self._writer.connections),
+        )
         if complete is not None:
             complete(written, content)
         written.rename(self._target)
@@ -220,22 +229,18 @@ def read_content(path: Path) -> FileContent:
     """
     try:
         with Reader(path) as reader:
-            topics = []
-            for connection in reader.connections:
-                extension = connection.ext
-                assert isinstance(extension, ConnectionExtRosbag2)
-                qos = next(iter(extension.offered_qos_profiles), None)
-                content = topic_content(
-                    connection.topic,
-                    connection.msgtype,
-                    hash_of(connection.msgtype, connection.msgdef),
-                    qos,
-                    connection.msgcount,
-                )
-                topics.append(content)
-            return FileContent(path.name, reader.start_time, reader.end_time - 1, tuple(topics))
+            topics = tuple(
+                _topic_of(c, hash_of(c.msgtype, c.msgdef), c.msgcount) for c in reader.connections
+            )
+            return FileContent(path.name, reader.start_time, reader.end_time - 1, topics)
     except _DAMAGE as error:
         raise _damaged(path, error) from error
+
+
+def _topic_of(connection: Connection, type_hash: str, count: int) -> TopicContent:
+    assert isinstance(connection.ext, ConnectionExtRosbag2)
+    qos = next(iter(connection.ext.offered_qos_profiles), None)
+    return topic_content(connection.topic, connection.msgtype, type_hash, qos, count)
 
 
 def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str, Any]]:
@@ -280,10 +285,6 @@ def _damaged(path: Path, error: Exception) -> ValueError:
     return ValueError(f"{path.name}: damaged or foreign file ({reason})")
 
 
-# the compiled one, where there is one: a run of a thousand points has ten thousand lines
-_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-
 def write_bag_metadata(folder: Path, files: Sequence[FileContent]) -> None:
     """Make all these files of a folder one bag.
 
@@ -306,38 +307,38 @@ def write_bag_metadata(folder: Path, files: Sequence[FileContent]) -> None:
         "topics_with_message_count": [_topic(topic) for topic in _merged_topics(files)],
         "compression_format": "",
         "compression_mode": "",
-        "relative_file_paths": [file.name for file in files],
-        "files": [
-            {
-                "path": file.name,
-                "starting_time": {"nanoseconds_since_epoch": file.start_ns},
-                "duration": {"nanoseconds": file.end_ns - file.start_ns},
-                "message_count": file.count,
-            }
-            for file in files
-        ],
         "custom_data": None,
         "ros_distro": "rosbags",
     }
-    text = yaml.dump(
-        {"rosbag2_bagfile_information": content},
-        Dumper=_DUMPER,
-        sort_keys=False,
-        allow_unicode=True,
-    )
+    text = yaml.safe_dump({"rosbag2_bagfile_information": content}, sort_keys=False, allow_unicode=True)
+    # by hand: of ten thousand files a dumper makes a hundred thousand nodes
+    names = [json.dumps(file.name) for file in files]
+    text += f"  relative_file_paths: [{_COMMA.join(names)}]\n  files: [{_COMMA.join(map(_file, files))}]\n"
     write_whole(folder / "metadata.yaml", text.encode())
     sync_folder(folder)
 
 
+_COMMA = ",\n    "
+
+
+def _file(file: FileContent) -> str:
+    entry = {
+        "path": file.name,
+        "starting_time": {"nanoseconds_since_epoch": file.start_ns},
+        "duration": {"nanoseconds": file.end_ns - file.start_ns},
+        "message_count": file.count,
+    }
+    return json.dumps(entry)
+
+
 def _merged_topics(files: Sequence[FileContent]) -> list[TopicContent]:
     """Topics of all files together, by name."""
-    merged: dict[str, TopicContent] = {}
+    counts, merged = Counter[str](), dict[str, TopicContent]()
     for file in files:
         for topic in file.topics:
-            before = merged.get(topic.name)
-            count = topic.count + (before.count if before else 0)
-            merged[topic.name] = replace(topic, count=count)
-    return [topic for _, topic in sorted(merged.items())]
+            counts[topic.name] += topic.count
+            merged[topic.name] = topic
+    return [replace(topic, count=counts[name]) for name, topic in sorted(merged.items())]
 
 
 def _topic(topic: TopicContent) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def colours(share: npt.ArrayLike) -> FloatArray:
     return np.asarray(low + np.asarray(share, float)[..., None] * (high - low))
 
 
-_Cell = tuple[str, tuple[float, ...]]  # frame, and three whole numbers
+_Cell = tuple[str, float, float, float]  # frame, and three whole numbers
 SAME_PLACE_M = 1e-4
 LONE_SPACING_M = 0.005
 """What a single point is taken to be apart from others where it is drawn [m]."""
@@ -53,7 +53,7 @@ _MOST_SEGMENTS = 36_000  # of all together, as far as the least allow
 _CELLS = 80  # of the raster of a boundary, along its longer side
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)  # a map keeps one for each of its points
 class MapPoint:
     """One place of the map.
 
@@ -250,10 +250,9 @@ class GrowingMap:
     """A map while its points come; what one of them costs does not depend on how many there are."""
 
     def __init__(self, results: Iterable[PointResult] = ()) -> None:
-        self._points: dict[int, MapPoint] = {}  # by number, in the order in which they came
-        self._at: defaultdict[_Cell, list[int]] = defaultdict(list)  # numbers by place
-        self._of_measurement: dict[int, int] = {}
-        self._numbers = itertools.count()
+        self._points: dict[MapPoint, None] = {}  # in the order in which they came
+        self._at: defaultdict[_Cell, list[MapPoint]] = defaultdict(list)  # by place
+        self._of_measurement: dict[int, MapPoint] = {}
         self._map: PoleMap | None = None
         for result in results:
             self.take(result)
@@ -265,19 +264,18 @@ class GrowingMap:
     def map(self) -> PoleMap:
         """As it is now."""
         if self._map is None:
-            self._map = PoleMap(tuple(self._points.values()))
+            self._map = PoleMap(tuple(self._points))
         return self._map
 
     def add(self, point: MapPoint) -> None:
         """Take a point; it replaces what its own measurement or place had before."""
         self.clear(point.result)
-        own, number = point.result.measurement_id, next(self._numbers)
-        if own:  # 0: it came to no measurement
+        if own := point.result.measurement_id:  # 0: it came to no measurement
             if own in self._of_measurement:
                 self._remove(self._of_measurement[own])
-            self._of_measurement[own] = number
-        self._points[number] = point
-        self._at[_cell(point.result)].append(number)
+            self._of_measurement[own] = point
+        self._points[point] = None
+        self._at[_cell(point.result)].append(point)
         self._map = None
 
     def take(self, result: PointResult) -> None:
@@ -291,23 +289,23 @@ class GrowingMap:
 
     def clear(self, result: PointResult) -> None:
         """Leave nothing at the place of a result."""
-        frame_id, cell = _cell(result)
+        frame_id, *cell = _cell(result)
         place = result.x_m, result.y_m, result.z_m
         for step in itertools.product((-1, 0, 1), repeat=3):
-            near = tuple(k + one for k, one in zip(cell, step, strict=True))
-            for number in tuple(self._at.get((frame_id, near), ())):
-                other = self._points[number].result
+            near = (frame_id, *(k + one for k, one in zip(cell, step, strict=True)))
+            for point in tuple(self._at.get(near, ())):
+                other = point.result
                 if math.dist(place, (other.x_m, other.y_m, other.z_m)) <= SAME_PLACE_M:
-                    self._remove(number)
+                    self._remove(point)
 
-    def _remove(self, number: int) -> None:
-        result = self._points.pop(number).result
-        at = self._at[_cell(result)]
-        at.remove(number)
+    def _remove(self, point: MapPoint) -> None:
+        del self._points[point]
+        at = self._at[_cell(point.result)]
+        at.remove(point)
         if not at:
-            del self._at[_cell(result)]
-        if self._of_measurement.get(result.measurement_id) == number:
-            del self._of_measurement[result.measurement_id]
+            del self._at[_cell(point.result)]
+        if self._of_measurement.get(point.result.measurement_id) is point:
+            del self._of_measurement[point.result.measurement_id]
         self._map = None
 
 
@@ -320,7 +318,8 @@ def _cell(result: PointResult) -> _Cell:
     """Frame and cell of a place, the cells as wide as a place is; nothing is near one that is not known."""
     place = result.x_m, result.y_m, result.z_m
     known = all(map(math.isfinite, place))
-    return result.frame_id, tuple(math.floor(x / SAME_PLACE_M) if known else math.nan for x in place)
+    x, y, z = (math.floor(x / SAME_PLACE_M) if known else math.nan for x in place)
+    return result.frame_id, x, y, z
 
 
 def _on_a_line(xy_m: FloatArray) -> bool:

@@ -79,8 +79,16 @@ class RunContent:
     @property
     def paths_in_order(self) -> list[Path]:
         """Finished files, in the order in which they were recorded."""
+        return self.paths_with("")
+
+    def paths_with(self, type_name: str) -> list[Path]:
+        """Of `paths_in_order` those that hold messages of a type; an empty one: all."""
         files = sorted(self.files, key=lambda file: (file.start_ns, file.name))
-        return [self.path / RECORDING / file.name for file in files]
+        return [
+            self.path / RECORDING / file.name
+            for file in files
+            if not type_name or any(topic.type_name == type_name for topic in file.topics)
+        ]
 
     def messages_at(self, type_name: str) -> dict[int, int]:
         """How many messages of a type the latest attempt at a point holds, by index; none: left out."""

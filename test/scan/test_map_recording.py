@@ -122,8 +122,9 @@ def test_late_readers_get_the_map_of_a_file_that_is_played(folder):
     }
 
 
-def test_a_long_run_is_drawn_at_some_points_and_at_the_last(folder, monkeypatch):
-    monkeypatch.setattr(map_recording, "MOST_STATES", 2)
+@pytest.mark.parametrize(("bound", "most"), [("MOST_STATES", 2), ("MOST_DRAWN", 2 * 4)])
+def test_a_long_run_is_drawn_at_some_points_and_at_the_last(folder, monkeypatch, bound, most):
+    monkeypatch.setattr(map_recording, bound, most)
     path = write_map_recording(read_run(folder))  # in place of the one before
     assert [cloud.width for _, cloud in told(path, "/pole_map")] == [2, 2]  # of four
     crosses = told(path, "/pole_map/markers")[-1][1].markers[1]
