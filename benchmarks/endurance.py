@@ -30,9 +30,15 @@ from tactile_resonance.scan.point_file import FileContent
 from tactile_resonance.scan.point_result import TYPE, PointResult, from_message, serialised
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
 from tactile_resonance.scan.progress import Controls
-from tactile_resonance.scan.run_content import RECORDING, file_of, read_run
+from tactile_resonance.scan.run_content import (
+    RECORDING,
+    entry_of,
+    file_of,
+    read_index,
+    read_run,
+    write_entries,
+)
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.run_index import entry_of, read_entries, write_entries
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -234,7 +240,7 @@ def run(output: Path, quick: bool, points: int = POINTS) -> str:
 
 def fill(run: Path, points: int) -> int:
     """Finish the points of a run up to so many, each with the file of the last one; the number of points."""
-    content, entries = read_run(run), list(read_entries(run).values())
+    content, entries = read_run(run), list(read_index(run)[0].values())
     like, kept = content.latest[-1], content.files[-1]
     file = file_of(run, like).read_bytes()
     for point in content.points[len(content.latest) : points]:

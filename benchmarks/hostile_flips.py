@@ -17,8 +17,7 @@ from tactile_resonance.recording.files import read_recording
 from tactile_resonance.recording.stored_file import read_stored, write_stored
 from tactile_resonance.scan.kept_bins import NAME, kept_bins
 from tactile_resonance.scan.recorded import measurements_of_file
-from tactile_resonance.scan.run_content import RECORDING, read_run
-from tactile_resonance.scan.run_index import INDEX
+from tactile_resonance.scan.run_content import INDEX, RECORDING, read_run
 
 FLIPS, QUICK_FLIPS = 1000, 80
 SEED = 2

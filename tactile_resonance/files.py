@@ -16,7 +16,7 @@ PART = ".part"
 
 
 def write_whole(path: Path, content: bytes, written: Callable[[], None] | None = None) -> None:
-    """Write a file that is there whole or not at all.
+    """Write a file that is there whole or not at all, also after a power cut.
 
     Parameters
     ----------
@@ -46,9 +46,21 @@ def write_whole(path: Path, content: bytes, written: Callable[[], None] | None =
                 written()
             os.fsync(file.fileno())
         part.replace(path)
+        sync(path.parent)
     finally:
         if not told:
             part.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Make a file, or the names in a folder, durable."""
+    if os.name == "nt" and path.is_dir():  # cannot be opened there; its file system journals names
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:

@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tactile_resonance.files import PART
+from tactile_resonance.files import PART, sync
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
-from tactile_resonance.recording.stored_file import read_stored, sync_folder, write_stored
+from tactile_resonance.recording.stored_file import read_stored, write_stored
 
 _MEASUREMENT = re.compile(r"(\d+)-(\d+)")
 _EXCITATION = re.compile(r"excitation-(\d+)\.npz")
@@ -60,7 +60,7 @@ class RecordStore:
         existed = self.folder.is_dir()
         self.folder.mkdir(parents=True, exist_ok=True)
         if not existed:
-            sync_folder(self.folder.parent)
+            sync(self.folder.parent)
         if self._known is None:
             entries, _ = list_measurements(self.folder)
             self._known = {entry.measurement_id for entry in entries}
@@ -78,7 +78,7 @@ class RecordStore:
             )
         path = self.folder / f"{self._number + 1:06d}-{key}"
         path.mkdir()
-        sync_folder(self.folder)
+        sync(self.folder)
         self._number += 1
         self._known.add(key)
         self._measurements[key] = path

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import io
-import os
 import tokenize
 import zipfile
 import zlib
@@ -59,7 +58,6 @@ def write_stored(
     buffer = io.BytesIO()
     np.savez(buffer, **content)  # type: ignore[arg-type]
     write_whole(path, buffer.getvalue(), written)
-    sync_folder(path.parent)
 
 
 def read_stored(path: Path, kind: type[T]) -> T:
@@ -81,17 +79,6 @@ def read_stored(path: Path, kind: type[T]) -> T:
     except _DAMAGE as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise ValueError(f"{path.name}: damaged or foreign file ({reason})") from error
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable."""
-    if os.name == "nt":  # Windows cannot open folders; its file system journals names
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _flatten(prefix: str, value: Any, content: Fields) -> None:

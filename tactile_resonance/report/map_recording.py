@@ -32,8 +32,7 @@ from tactile_resonance.tissue.classify import UNKNOWN
 
 FILE = "map.mcap"
 MOST_STATES, MOST_DRAWN = 100, 100_000
-"""So often the map is drawn, at most, and so many points all those times together would have at the end: a state
-of a map of thousands takes megabytes."""
+"""So often the map is drawn at most, so many points in all: a state of a map of thousands takes megabytes."""
 _PROBABILITY, _CELLS = 0.95, 40  # as of pole_map_node
 _POSE, _TF = "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
 _LATCHED = offered_qos(1, latched=True)
@@ -45,7 +44,8 @@ def write_map_recording(run: RunContent) -> Path | None:
     """Write ``map.mcap`` into the folder of a run, in place of the one that is there.
 
     Topics are those of pole_map_node, after each point or after `MOST_STATES` of them, fewer where there are
-    thousands of points, the surface after the last; and ``/tf``, ``/tf_static``. All stamps are times of recording, so that the file stands for itself.
+    thousands of points, the surface after the last; and ``/tf``, ``/tf_static``. All stamps are times of
+    recording, so that the file stands for itself.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def _write_frames(writer: PointFileWriter, run: RunContent) -> str:
         turn = quaternion_from_vector(vector(pose.rotation_rad))
         frame = _transform(base, frame_id, start_ns, vector(pose.position_m), turn)
         _write(writer, "/tf_static", start_ns, make_message(_TF, transforms=[frame]), _LATCHED)
-    for path in run.paths_with(_POSE):
+    for path in run.paths(_POSE):
         for time_ns, _, message in read_messages_of_type(path, _POSE):
             at, turn = message.pose.position, message.pose.orientation
             position, quaternion = (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)

@@ -27,7 +27,7 @@ from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import BEFORE, read_reference
-from tactile_resonance.scan.run_content import RECORDING, RunContent, file_of
+from tactile_resonance.scan.run_content import RunContent, file_of
 
 Figure = dict[str, Any]
 Trace = dict[str, Any]  # of plotly
@@ -99,10 +99,6 @@ def _by_class(results: Sequence[PointResult]) -> dict[str, list[PointResult]]:
     return dict(sorted(classes.items(), key=lambda item: -len(item[1])))
 
 
-def _air_file(run: RunContent) -> str | None:
-    return next((file.name for file in run.files if file.name.endswith(f"-{BEFORE}.mcap")), None)
-
-
 def _responses(
     run: RunContent,
     classes: Mapping[str, Sequence[PointResult]],
@@ -111,8 +107,8 @@ def _responses(
     """Figure 5: response and levels of noise and, over realisations, of all that scatters."""
     title = "FRF with its noise, by tissue (figure 5)"
     cases: dict[str, Any] = {}
-    if name := _air_file(run):
-        for _, _, message in read_messages_of_type(run.path / RECORDING / name, FRF_TYPE):
+    for path in run.paths(FRF_TYPE, reference=BEFORE)[:1]:
+        for _, _, message in read_messages_of_type(path, FRF_TYPE):
             cases["free air"] = message
     for name, results in list(classes.items())[:_MOST_CASES]:
         frfs = [(r, details[r.index].frf) for r in results if r.index in details]

@@ -28,7 +28,7 @@ from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
 from tactile_resonance.scan.protocols import TYPE as TEST_TYPE
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
-from tactile_resonance.scan.run_content import RECORDING, RunContent, not_checked
+from tactile_resonance.scan.run_content import RunContent, not_checked
 from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
 from tactile_resonance.silent import SilentRecord, silent_record
 from tactile_resonance.strict_yaml import parse_yaml
@@ -301,20 +301,17 @@ def read_silent(run: RunContent) -> SilentRecord | None:
     ValueError
         If its file is damaged or holds no samples.
     """
-    for file in run.files:
-        if file.name.endswith(f"-{SILENT}.mcap"):
-            for stored in measurements_of_file(run.path / RECORDING / file.name):
-                records = stored.records
-                if not records or stored.gaps:
-                    raise ValueError(
-                        f"{file.name}: {len(records)} records, expected some without a gap"
-                    )
-                u, y = (
-                    np.stack([getattr(record, channel).volts() for record in records])
-                    for channel in ("actuator", "sensor")
-                )  # (P, N)
-                return silent_record(u, y, sample_rate_hz=records[0].sample_rate_hz)
-            raise ValueError(f"{file.name}: no measurement, expected a silent one")
+    for path in run.paths(reference=SILENT):
+        for stored in measurements_of_file(path):
+            records = stored.records
+            if not records or stored.gaps:
+                raise ValueError(f"{path.name}: {len(records)} records, expected some without a gap")
+            u, y = (
+                np.stack([getattr(record, channel).volts() for record in records])
+                for channel in ("actuator", "sensor")
+            )  # (P, N)
+            return silent_record(u, y, sample_rate_hz=records[0].sample_rate_hz)
+        raise ValueError(f"{path.name}: no measurement, expected a silent one")
     return None
 
 

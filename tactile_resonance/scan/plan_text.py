@@ -187,8 +187,8 @@ def plan_against_outcome(scene: ScanScene, run: RunContent) -> list[tuple[str, s
         told = sum(bool(result.distortion) for result in done)
         rows.append(("distortion", "at every point", f"at {told} of {len(done)}"))
     if Output.SILENT in scene.outputs:
-        came = any(f"-{SILENT}." in file.name for file in run.files)
-        rows.append(("silent record", "before the first point", "taken" if came else "missing"))
+        came = "taken" if run.paths(reference=SILENT) else "missing"
+        rows.append(("silent record", "before the first point", came))
     return rows
 
 

@@ -1,10 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One MCAP file, written out of sight and then there whole; what it holds, and what makes many one bag."""
+"""One MCAP file, written out of sight and then there whole; what it holds, its checksums, and many as one bag.
+
+A finished file holds three kinds of CRC-32, which say without any other file whether it is damaged: of the
+content of each chunk, of all bytes of its data section, and of its summary; 0: none. rosbags compares the first
+when it reads messages, and writes none: they are filled in when a file is complete.
+
+References
+----------
+MCAP format specification, records Chunk (op 0x06), Data End (0x0F) and Footer (0x02),
+https://mcap.dev/spec.
+"""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import struct
 from collections import Counter
@@ -13,8 +22,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
+from zlib import crc32
 
-import yaml
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -30,9 +39,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError
 
-from tactile_resonance.files import write_whole
-from tactile_resonance.recording.stored_file import sync_folder
-from tactile_resonance.scan.mcap_checksums import write_checksums
+from tactile_resonance.files import sync, write_whole
 from tactile_resonance.scan.messages import (
     OtherVersionError,
     definition_and_hash,
@@ -43,6 +50,16 @@ from tactile_resonance.scan.messages import (
 BAG_VERSION: Literal[9] = 9
 # rosbags parses the QoS of every topic of every file anew, 2 ms each: few texts differ
 storage_mcap.get_qos = cache(storage_mcap.get_qos)
+_MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")  # op and length, before the content
+_CRC = struct.Struct("<I")
+_SIZE = struct.Struct("<Q")
+_FOOTER, _CHUNK, _DATA_END = 0x02, 0x06, 0x0F
+# Of a chunk's content: first and last time and size come before its checksum, then the name of the compression.
+_CHUNK_CRC = 24
+# Of the footer's: starts of summary and of its offsets come before the checksum.
+_FOOTER_CRC = 16
+_NEXT = ",\n    "  # between the entries of a list
 _FOREVER = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
 
@@ -96,10 +113,9 @@ class FileContent:
     end_ns: int
     topics: tuple[TopicContent, ...]
 
-    @property
-    def count(self) -> int:
-        """Messages of all topics."""
-        return sum(topic.count for topic in self.topics)
+    def messages(self, type_name: str = "") -> int:
+        """How many of a type it holds; of an empty one: of all."""
+        return sum(topic.count for topic in self.topics if type_name in ("", topic.type_name))
 
 
 class PointFileWriter:
@@ -193,11 +209,7 @@ class PointFileWriter:
         self._writer.close()
         written = self._folder / self._target.name
         write_checksums(written)
-        descriptor = os.open(written, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        sync(written)
         content = FileContent(
             self._target.name,
             self._writer.min_timestamp,
@@ -207,7 +219,7 @@ class PointFileWriter:
         if complete is not None:
             complete(written, content)
         written.rename(self._target)
-        sync_folder(self._target.parent)
+        sync(self._target.parent)
         shutil.rmtree(self._folder, ignore_errors=True)
         return content
 
@@ -298,37 +310,35 @@ def write_bag_metadata(folder: Path, files: Sequence[FileContent]) -> None:
     files = sorted(files, key=lambda file: (file.start_ns, file.name))
     start_ns = min((file.start_ns for file in files), default=0)
     end_ns = max((file.end_ns for file in files), default=0)
-    content = {
+    content: dict[str, Any] = {
         "version": BAG_VERSION,
         "storage_identifier": "mcap",
         "duration": {"nanoseconds": end_ns - start_ns},
         "starting_time": {"nanoseconds_since_epoch": start_ns},
-        "message_count": sum(file.count for file in files),
+        "message_count": sum(file.messages() for file in files),
         "topics_with_message_count": [_topic(topic) for topic in _merged_topics(files)],
         "compression_format": "",
         "compression_mode": "",
+        "relative_file_paths": [file.name for file in files],
+        "files": [
+            {
+                "path": file.name,
+                "starting_time": {"nanoseconds_since_epoch": file.start_ns},
+                "duration": {"nanoseconds": file.end_ns - file.start_ns},
+                "message_count": file.messages(),
+            }
+            for file in files
+        ],
         "custom_data": None,
         "ros_distro": "rosbags",
     }
-    text = yaml.safe_dump({"rosbag2_bagfile_information": content}, sort_keys=False, allow_unicode=True)
-    # by hand: of ten thousand files a dumper makes a hundred thousand nodes
-    names = [json.dumps(file.name) for file in files]
-    text += f"  relative_file_paths: [{_COMMA.join(names)}]\n  files: [{_COMMA.join(map(_file, files))}]\n"
+    # JSON is YAML, and takes a hundredth of the time and memory of its nodes: a long run has ten thousand files
+    text = "rosbag2_bagfile_information:\n"
+    for key, value in content.items():
+        listed = isinstance(value, list)
+        told = f"[{_NEXT.join(map(json.dumps, value))}]" if listed else json.dumps(value)
+        text += f"  {key}: {told}\n"
     write_whole(folder / "metadata.yaml", text.encode())
-    sync_folder(folder)
-
-
-_COMMA = ",\n    "
-
-
-def _file(file: FileContent) -> str:
-    entry = {
-        "path": file.name,
-        "starting_time": {"nanoseconds_since_epoch": file.start_ns},
-        "duration": {"nanoseconds": file.end_ns - file.start_ns},
-        "message_count": file.count,
-    }
-    return json.dumps(entry)
 
 
 def _merged_topics(files: Sequence[FileContent]) -> list[TopicContent]:
@@ -352,3 +362,79 @@ def _topic(topic: TopicContent) -> dict[str, Any]:
         },
         "message_count": topic.count,
     }
+
+
+def write_checksums(path: Path) -> None:
+    """Fill in all checksums of a complete file without compression, as rosbags writes it.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file.
+    """
+    with path.open("r+b") as file:
+        content = bytearray(file.read())
+        for place, crc in _checksums(content):
+            _CRC.pack_into(content, place, crc)  # those that follow count it in
+            file.seek(place)
+            file.write(_CRC.pack(crc))
+
+
+def is_checked(path: Path) -> bool:
+    """Whether a file has checksums, all of which agree with it; False: an earlier version wrote none.
+
+    Raises
+    ------
+    ValueError
+        If one does not agree, or records do not follow each other as in a complete file.
+    OSError
+        If it cannot be read.
+    """
+    content = path.read_bytes()
+    try:
+        found = [(_CRC.unpack_from(content, place)[0], crc) for place, crc in _checksums(content)]
+        if not any(written for written, _ in found):
+            return False
+        if any(written != crc for written, crc in found):
+            raise ValueError("its content does not agree with its checksums")
+    except ValueError as error:
+        raise _damaged(path, error) from error
+    return True
+
+
+def _checksums(content: bytes | bytearray) -> Iterator[tuple[int, int]]:
+    """Place of each checksum and what it must be, in the order in which they depend on each other."""
+    view = memoryview(content)
+    if len(view) < 2 * len(_MAGIC) or view[:8] != _MAGIC or view[-8:] != _MAGIC:
+        raise ValueError("not complete, or no MCAP file")
+    end, at, summary, op = len(view) - len(_MAGIC), len(_MAGIC), None, 0
+    while op != _FOOTER:
+        if at + _RECORD.size > end:
+            raise ValueError("its records end before its footer")
+        op, size = _RECORD.unpack_from(view, at)
+        begin, record = at, at + _RECORD.size
+        at = record + size
+        if at > end:
+            raise ValueError("a record is longer than the file")
+        if op == _CHUNK:
+            yield record + _CHUNK_CRC, crc32(_records(view[record:at]))
+        elif op == _DATA_END and size == _CRC.size and summary is None:
+            yield record, crc32(view[:begin])
+            summary = at
+    if summary is None or at != end or size != _FOOTER_CRC + _CRC.size:
+        raise ValueError("its records are not those of a complete file")
+    footer = record + _FOOTER_CRC
+    yield footer, crc32(view[summary:footer])
+
+
+def _records(chunk: memoryview) -> memoryview:
+    """Content of a chunk without compression, from that of its record."""
+    try:
+        (name,) = _CRC.unpack_from(chunk, _CHUNK_CRC + 4)
+        begin = _CHUNK_CRC + 8 + name
+        (size,) = _SIZE.unpack_from(chunk, begin)
+    except struct.error as error:
+        raise ValueError("a chunk is cut short") from error
+    if name or begin + 8 + size != len(chunk):
+        raise ValueError("a chunk is compressed or cut short")
+    return chunk[begin + 8 :]

@@ -5,13 +5,16 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from enum import Enum, IntEnum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import (
@@ -26,6 +29,7 @@ TYPE = "tactile_resonance/msg/PointResult"
 DISTORTION_TYPE = "tactile_resonance/msg/Distortion"
 POLES_TYPE = "tactile_resonance/msg/Poles"
 RESULTS_DEPTH = 4096  # of the nodes that publish them
+RESULTS = "results.csv"
 NAN = float("nan")
 
 
@@ -183,6 +187,7 @@ _OF_BANDS = ("distortion", "further")
 # in the order of the message, the header's two last
 COLUMNS = tuple(field.name for field in fields(PointResult) if field.name not in _OF_BANDS)
 BAND_COLUMNS = tuple(field.name for field in fields(BandResult))[2:]
+_DISTORTION_COLUMNS = tuple(field.name for field in fields(BandDistortion))[2:]
 _OF_FIRST_BAND = tuple(
     name
     for name in COLUMNS
@@ -269,3 +274,75 @@ def band_results(poles: Poles) -> tuple[BandResult, ...]:
         )
         for band in poles.further
     )
+
+
+def as_csv(results: Iterable[PointResult]) -> str:
+    """One row each, numbers with all their digits, unknown numbers ``nan``.
+
+    Where a result has them, columns for the poles of further bands, numbered from ``f0_hz_2``, and for the
+    distortion in each band, ``distortion_even_db``, ``distortion_even_db_2``, ..., follow the others. A text
+    that a spreadsheet would take for a formula begins with an apostrophe.
+    """
+    return _table([_row(result) for result in results])[0]
+
+
+class ResultsFile:
+    """``results.csv`` as it grows: a row is appended where it can be, else all are written anew.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    results : sequence of PointResult
+        Latest attempts, by index; written at once.
+    """
+
+    def __init__(self, folder: Path, results: Sequence[PointResult] = ()) -> None:
+        self._path = folder / RESULTS
+        self._write(results)
+
+    def add(self, result: PointResult, latest: Callable[[], Sequence[PointResult]]) -> None:
+        """Take in one result more.
+
+        Parameters
+        ----------
+        result : PointResult
+        latest : callable
+            Returns those of all points, by index, with this one; asked where all rows are written.
+        """
+        row = _row(result)
+        fits = result.index > self._last and row.keys() <= set(self._columns)
+        if not (fits and self._path.exists()):
+            self._write(latest())
+            return
+        with self._path.open("a", encoding="utf-8", newline="") as file:
+            file.write(csv_text([_cells(row, self._columns)]))
+        self._last = result.index
+
+    def _write(self, results: Sequence[PointResult]) -> None:
+        self._last = max((result.index for result in results), default=-1)
+        text, self._columns = _table([_row(result) for result in results])
+        write_whole(self._path, text.encode())
+
+
+def _row(result: PointResult) -> dict[str, object]:
+    """By column."""
+    row: dict[str, object] = {name: getattr(result, name) for name in COLUMNS}
+    row |= {"outcome": result.outcome.name.lower(), "kind": result.kind.value}
+    for k, band in enumerate(result.further):
+        row |= {f"{name}_{k + 2}": getattr(band, name) for name in BAND_COLUMNS}
+    for k, each in enumerate(result.distortion):
+        number = f"_{k + 1}" if k else ""
+        row |= {f"distortion_{n}{number}": getattr(each, n) for n in _DISTORTION_COLUMNS}
+    return row
+
+
+def _cells(row: Mapping[str, object], columns: Iterable[str]) -> list[object]:
+    return [row.get(name, NAN) for name in columns]
+
+
+def _table(rows: Sequence[Mapping[str, object]]) -> tuple[str, list[str]]:
+    """Text of a table, and its columns: those that any row has, distortion last."""
+    names = dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)])
+    columns = sorted(names, key=lambda name: name.startswith("distortion_"))
+    return csv_text([columns, *(_cells(row, columns) for row in rows)]), columns

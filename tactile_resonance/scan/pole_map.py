@@ -289,11 +289,10 @@ class GrowingMap:
 
     def clear(self, result: PointResult) -> None:
         """Leave nothing at the place of a result."""
-        frame_id, *cell = _cell(result)
+        frame_id, x, y, z = _cell(result)
         place = result.x_m, result.y_m, result.z_m
-        for step in itertools.product((-1, 0, 1), repeat=3):
-            near = (frame_id, *(k + one for k, one in zip(cell, step, strict=True)))
-            for point in tuple(self._at.get(near, ())):
+        for dx, dy, dz in itertools.product((-1, 0, 1), repeat=3):
+            for point in tuple(self._at.get((frame_id, x + dx, y + dy, z + dz), ())):
                 other = point.result
                 if math.dist(place, (other.x_m, other.y_m, other.z_m)) <= SAME_PLACE_M:
                     self._remove(point)

@@ -21,8 +21,14 @@ from tactile_resonance.scan.point_result import (
     from_message,
     serialised,
 )
-from tactile_resonance.scan.run_content import POINT_FILE, RECORDING, RunContent, file_of, read_run
-from tactile_resonance.scan.run_index import read_entries
+from tactile_resonance.scan.run_content import (
+    POINT_FILE,
+    RECORDING,
+    RunContent,
+    file_of,
+    read_index,
+    read_run,
+)
 
 EXCITATION = "tactile_resonance/msg/Excitation"
 RECORD = "tactile_resonance/msg/Record"
@@ -69,7 +75,7 @@ def run_entries(run: Path) -> list[StoredEntry]:
 def _entries(run: RunContent) -> list[StoredEntry]:
     return [
         StoredEntry(key, path, _read, _place_of(path))
-        for path in run.paths_in_order
+        for path in run.paths()
         for key in _ids_of(path)
     ]
 
@@ -127,8 +133,8 @@ def recorded_results(run: RunContent) -> Iterator[bytes]:
 
     In runs of earlier versions references have none, and poles are the last ones in the file of the point.
     """
-    entries = read_entries(run.path)
-    for path in run.paths_in_order:
+    entries, _ = read_index(run.path)
+    for path in run.paths():
         entry = entries.get(f"{RECORDING}/{path.name}")
         if entry is not None and entry.result is not None:
             yield entry.message

@@ -15,7 +15,7 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE
-from tactile_resonance.scan.run_content import RECORDING, RunContent
+from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import DriftLimits
 
 SILENT, BEFORE, AFTER = "silent", "air-before", "air-after"
@@ -152,11 +152,9 @@ def read_reference(run: RunContent, name: str) -> AirReference | None:
 
 def _poles_of(run: RunContent, name: str) -> Poles | None:
     found = None
-    for file in run.files:
-        if not file.name.endswith(f"-{name}.mcap"):
-            continue
-        for _, topic, message in read_messages_of_type(run.path / RECORDING / file.name, POLES_TYPE):
-            if topic.rsplit("/", 1)[-1] == "poles":
+    for path in run.paths(POLES_TYPE, reference=name):
+        for _, topic, message in read_messages_of_type(path, POLES_TYPE):
+            if topic.rsplit("/", 1)[-1] == "poles":  # no truths
                 found, _ = poles_from_message(message)
     return found
 

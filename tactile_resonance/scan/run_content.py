@@ -1,33 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What lies in the folder of a run, read without changing anything."""
+"""What lies in the folder of a run, and what each of its files was when it was finished.
+
+``index.jsonl`` has one line per finished file, appended before the file gets its name: the checksum of the
+line, then JSON with size and checksum of the file, what it holds and its ``PointResult`` message. A run is read
+from these lines; a file that no longer agrees with its line is damaged. Checksums are CRC-32 (`zlib.crc32`):
+they detect damage, not forgery. Runs of earlier versions have no index; their files cannot be checked.
+"""
 
 from __future__ import annotations
 
+import base64
 import json
+import os
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 from zlib import crc32
 
+from rosbags.interfaces import Qos
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+from rosbags.serde import SerdeError
+
 from tactile_resonance.counted import counted
 from tactile_resonance.fields import read_dataclass
-from tactile_resonance.scan.mcap_checksums import is_checked
-from tactile_resonance.scan.point_file import FileContent, read_content, read_messages
-from tactile_resonance.scan.point_result import TOPIC, PointResult, from_message
-from tactile_resonance.scan.run_index import Entry, damaged_lines, read_entries
+from tactile_resonance.files import write_whole
+from tactile_resonance.scan.messages import definition_and_hash, message_types
+from tactile_resonance.scan.point_file import (
+    FileContent,
+    TopicContent,
+    is_checked,
+    read_content,
+    read_messages,
+    topic_content,
+)
+from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, from_message
 from tactile_resonance.scan.scan_point import ScanPoint
 
 FORMAT = "tactile_resonance run 1"
-RECORDING, SCENE = "recording", "scene.yaml"
+INDEX, RECORDING, SCENE = "index.jsonl", "recording", "scene.yaml"
 POINT_FILE = re.compile(r"point-(\d{5})-(\d{2,})\.mcap")
 CHECKSUM = "crc32"
 """Field of ``run.json``."""
 PLAN_DAMAGED = "run.json: differs from what was written (checksum)"
+_PART_BYTES = 1 << 20
+_NAME = re.compile(r"(?:recording/)?([\w-]{1,200}\.(?:mcap|yaml))")
 
 
 @dataclass(frozen=True)
@@ -76,27 +97,29 @@ class RunContent:
         finished = {result.index for result in self.results}
         return next((point for point in self.points if point.index not in finished), None)
 
-    @property
-    def paths_in_order(self) -> list[Path]:
-        """Finished files, in the order in which they were recorded."""
-        return self.paths_with("")
+    def paths(self, type_name: str = "", reference: str = "") -> list[Path]:
+        """Finished files, in the order in which they were recorded.
 
-    def paths_with(self, type_name: str) -> list[Path]:
-        """Of `paths_in_order` those that hold messages of a type; an empty one: all."""
+        Parameters
+        ----------
+        type_name : str
+            Those that hold messages of this type; empty: all.
+        reference : str
+            Those of a reference of this name; empty: all.
+        """
         files = sorted(self.files, key=lambda file: (file.start_ns, file.name))
+        ending = f"-{reference}.mcap" if reference else ""
         return [
             self.path / RECORDING / file.name
             for file in files
-            if not type_name or any(topic.type_name == type_name for topic in file.topics)
+            if file.name.endswith(ending) and (not type_name or file.messages(type_name))
         ]
 
     def messages_at(self, type_name: str) -> dict[int, int]:
         """How many messages of a type the latest attempt at a point holds, by index; none: left out."""
-        counts = Counter[str]()
-        for file in self.files:
-            counts[file.name] += sum(t.count for t in file.topics if t.type_name == type_name)
+        counts = {file.name: file.messages(type_name) for file in self.files}
         names = {result.index: file_of(self.path, result).name for result in self.latest}
-        return {index: counts[name] for index, name in names.items() if counts[name]}
+        return {index: counts[name] for index, name in names.items() if counts.get(name)}
 
 
 def not_checked(files: int) -> str:
@@ -125,27 +148,29 @@ def read_run(path: Path) -> RunContent:
         listed = sorted((Path(path) / RECORDING).iterdir())
     except OSError as error:
         raise ValueError(f"run: {path} cannot be read as a run ({error})") from error
-    names = {
-        f"{RECORDING}/{file.name}": file for file in listed if file.suffix not in (".yaml", ".part")
-    }
+    paths = [file for file in listed if file.suffix not in (".yaml", ".part")]
     # after the names: each has its point in the plan and its line before
     run = read_plan(path)
-    entries = read_entries(run.path)
-    files, results, unchecked = [], [], 0
-    problems = [*run.problems, *damaged_lines(run.path), *_missing(run.path, entries)]
+    entries, damaged = read_index(run.path)
+    # the last one may never have been: its line is written before the file has its name
+    missing = [name for name in list(entries)[:-1] if not (run.path / name).exists()]
+    problems = [*run.problems, *damaged]
+    problems += [f"{Path(name).name}: finished, but no longer there" for name in missing]
     scene = entries.get(SCENE)
     if scene is not None and (damage := scene.damage(run.path / SCENE)):
         problems.append(f"{SCENE}: {damage}")
+    files, results, unchecked = [], [], 0
     with ThreadPoolExecutor() as pool:  # a checksum holds no lock of the interpreter
-        read = pool.map(lambda name: _checked(names[name], entries.get(name), run), names)
-        for content, result, problem, checked in read:
-            if content is not None:
-                files.append(content)
-                unchecked += not checked
+        of_files = [entries.get(f"{RECORDING}/{file.name}") for file in paths]
+        for read in pool.map(_finished, paths, of_files, repeat(len(run.points))):
+            if isinstance(read, str):
+                problems.append(read)
+                continue
+            content, result, checked = read
+            files.append(content)
+            unchecked += not checked
             if result is not None:
                 results.append(result)
-            if problem:
-                problems.append(problem)
     return replace(
         run,
         files=tuple(files),
@@ -155,42 +180,33 @@ def read_run(path: Path) -> RunContent:
     )
 
 
-def _missing(run: Path, entries: Mapping[str, Entry]) -> list[str]:
-    """Files that were finished and are no longer there.
-
-    The last one may never have been: its line is written before the file has its name.
-    """
-    return [
-        f"{Path(name).name}: finished, but no longer there"
-        for name in list(entries)[:-1]
-        if not (run / name).exists()
-    ]
-
-
-def _checked(
-    path: Path, entry: Entry | None, run: RunContent
-) -> tuple[FileContent | None, PointResult | None, str, bool]:
-    """What a file holds, its result, what is wrong with it, and whether it was compared with a checksum."""
+def _finished(
+    path: Path, entry: Entry | None, points: int
+) -> tuple[FileContent, PointResult | None, bool] | str:
+    """What a file holds, the result of its point, and whether it was checked; what is wrong with it as text."""
     try:
         if entry is not None and (damage := entry.damage(path)):
-            return None, None, f"{path.name}: {damage}", True
-        result = None if entry is None else entry.result
-        if entry is None or result is None:
-            checked = entry is not None or _is_checked(path)
-            return *_read_file(path, len(run.points)), "", checked
+            raise ValueError(f"{path.name}: {damage}")
+        checked = entry is not None or is_checked(path)
+        content, result = (None, None) if entry is None else (entry.content, entry.result)
         match = POINT_FILE.fullmatch(path.name)
-        named = None if match is None else _named(result, match, len(run.points))
-        return entry.content, named, "", True
+        if match is None and not re.fullmatch(r"reference-.*\.mcap", path.name):
+            raise ValueError(f"{path.name}: neither of a point nor a reference")
+        if content is None or result is None:
+            content = read_content(path)
+        if match is None:
+            return content, None, checked
+        if result is None:
+            found = [from_message(message) for _, _, message in read_messages(path, f"/{TOPIC}")]
+            if len(found) != 1:
+                raise ValueError(f"{path.name}: {len(found)} results, expected one")
+            result = found[0]
+        own = (result.index, result.attempt)
+        if own != (int(match[1]), int(match[2])) or result.index >= points:
+            raise ValueError(f"{path.name}: holds point and attempt {own}")
+        return content, result, checked
     except (OSError, ValueError) as error:
-        return None, None, str(error), True
-
-
-def _is_checked(path: Path) -> bool:
-    """Whether a file that is not in the index agrees with the checksums that it holds itself."""
-    try:
-        return is_checked(path)
-    except ValueError as error:
-        raise ValueError(f"{path.name}: damaged or foreign file ({error})") from error
+        return str(error)
 
 
 def in_order(results: Iterable[PointResult]) -> tuple[PointResult, ...]:
@@ -234,22 +250,144 @@ def checksum_of(content: Mapping[str, Any]) -> int:
     return crc32(json.dumps(content).encode())
 
 
-def _read_file(path: Path, points: int) -> tuple[FileContent, PointResult | None]:
-    match = POINT_FILE.fullmatch(path.name)
+@dataclass(frozen=True)
+class Entry:
+    """One finished file, as its line of the index states it.
+
+    Attributes
+    ----------
+    name : str
+        Relative to the run's folder.
+    size : int
+        [bytes]
+    crc32 : int
+        Of all its bytes.
+    content : FileContent or None
+        None: it is no recording.
+    message : bytes
+        Its ``msg/PointResult`` (CDR); empty: it has none.
+    """
+
+    name: str
+    size: int
+    crc32: int
+    content: FileContent | None = None
+    message: bytes = b""
+
+    @property
+    def result(self) -> PointResult | None:
+        """Of the message; None where there is none that can be read by the definition of today."""
+        topics = self.content.topics if self.content else ()
+        today = definition_and_hash(TYPE)[1]
+        if not any((topic.type_name, topic.type_hash) == (TYPE, today) for topic in topics):
+            return None
+        try:
+            return from_message(message_types().deserialize_cdr(self.message, TYPE))
+        except (SerdeError, ValueError):
+            return None
+
+    def damage(self, path: Path) -> str:
+        """What of a file is not as it was when it was finished; empty: nothing."""
+        size = path.stat().st_size
+        if size != self.size:
+            return f"has {size} bytes, {self.size} when it was finished"
+        return "" if crc32_of(path) == self.crc32 else "differs from what was finished (checksum)"
+
+
+def entry_of(
+    path: Path, name: str, content: FileContent | None = None, message: bytes = b""
+) -> Entry:
+    """Entry of a file that is complete; arguments as the fields of `Entry`."""
+    return Entry(name, path.stat().st_size, crc32_of(path), content, message)
+
+
+def crc32_of(path: Path) -> int:
+    """CRC-32 of a file's bytes."""
+    found = 0
+    with path.open("rb") as file:
+        while part := file.read(_PART_BYTES):
+            found = crc32(part, found)
+    return found
+
+
+def append_entry(run: Path, entry: Entry) -> None:
+    """Add a line, durably."""
+    with (run / INDEX).open("ab") as file:
+        file.write(_line(entry))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def write_entries(run: Path, entries: Iterable[Entry]) -> None:
+    """Replace all lines."""
+    write_whole(run / INDEX, b"".join(map(_line, entries)))
+
+
+def read_index(run: Path) -> tuple[dict[str, Entry], list[str]]:
+    """The last valid line of each file, by its name and in the order of the lines, and what lines are damaged.
+
+    A line that is damaged or of another format is left out: its file is then read, and checked only by what
+    it holds itself. What follows the last end of a line is left out too: an interruption cut it short.
+    """
+    entries, damaged = dict[str, Entry](), list[str]()
+    try:
+        lines = (run / INDEX).read_bytes().split(b"\n")[:-1]
+    except FileNotFoundError:
+        lines = []
+    for number, line in enumerate(lines, start=1):
+        checksum, _, text = line.partition(b" ")
+        if checksum != b"%08x" % crc32(text):
+            what = "is damaged; the file that it was of is compared with its own checksums alone"
+            damaged.append(f"{INDEX}: line {number} {what}")
+            continue
+        try:
+            entry = _entry(json.loads(text))
+        except (ValueError, TypeError, KeyError, AttributeError):  # of another version, or anyone's
+            continue
+        entries.pop(entry.name, None)
+        entries[entry.name] = entry
+    return entries, damaged
+
+
+def _line(entry: Entry) -> bytes:
+    fields: dict[str, Any] = {"name": entry.name, "size": entry.size, "crc32": entry.crc32}
+    if (content := entry.content) is not None:
+        topics = [
+            [t.name, t.type_name, t.type_hash, _qos_text(t.qos), t.count] for t in content.topics
+        ]
+        fields["content"] = [content.name, content.start_ns, content.end_ns, topics]
+    if entry.message:
+        fields["point_result"] = base64.b64encode(entry.message).decode()
+    text = json.dumps(fields, separators=(",", ":")).encode()
+    return b"%08x %s\n" % (crc32(text), text)
+
+
+def _entry(fields: Mapping[str, Any]) -> Entry:
+    match = _NAME.fullmatch(fields["name"])
     if match is None:
-        if not re.fullmatch(r"reference-.*\.mcap", path.name):
-            raise ValueError(f"{path.name}: neither of a point nor a reference")
-        return read_content(path), None
-    content = read_content(path)
-    found = [from_message(message) for _, _, message in read_messages(path, f"/{TOPIC}")]
-    if len(found) != 1:
-        raise ValueError(f"{path.name}: {len(found)} results, expected one")
-    return content, _named(found[0], match, points)
+        raise ValueError(f"name: {fields['name']!r}")
+    content = None
+    if "content" in fields:
+        _, start_ns, end_ns, topics = fields["content"]
+        times_ns = _whole(start_ns), _whole(end_ns)
+        content = FileContent(match[1], *times_ns, tuple(_topic(*topic) for topic in topics))
+    message = base64.b64decode(fields.get("point_result", ""))
+    return Entry(fields["name"], _whole(fields["size"]), _whole(fields["crc32"]), content, message)
 
 
-def _named(result: PointResult, match: re.Match[str], points: int) -> PointResult:
-    """The result, which must be that of its file's name."""
-    own = (result.index, result.attempt)
-    if own != (int(match[1]), int(match[2])) or result.index >= points:
-        raise ValueError(f"{match[0]}: holds point and attempt {own}")
-    return result
+def _whole(value: object) -> int:
+    if type(value) is not int or not 0 <= value < 1 << 64:
+        raise ValueError(f"no whole number: {value!r}")
+    return value
+
+
+def _qos_text(qos: Qos | None) -> str:
+    return json.dumps([] if qos is None else dump_qos_v9([qos]), separators=(",", ":"))
+
+
+@cache
+def _topic(name: str, type_name: str, type_hash: str, qos: str, count: int) -> TopicContent:
+    if not all(isinstance(text, str) for text in (name, type_name, type_hash)):
+        raise TypeError("topic: no texts")
+    offered = next(iter(parse_qos(json.loads(qos))), None)
+    return topic_content(name, type_name, type_hash, offered, _whole(count))

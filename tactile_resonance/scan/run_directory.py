@@ -9,7 +9,7 @@
     RUN/recording/point-00003-00.mcap   one file per attempt at a point (here point 3, first attempt)
     RUN/recording/reference-00-air.mcap references of the session
     RUN/recording/metadata.yaml         makes all of them one rosbag2 recording
-    RUN/index.jsonl                     checksum, content and result of each finished file: `scan.run_index`
+    RUN/index.jsonl                     checksum, content and result of each finished file: `scan.run_content`
     RUN/results.csv                     one row per finished point, its latest attempt
 
 A point is finished when its file is there. Files get their names when they are complete, on disk and in
@@ -35,8 +35,7 @@ from typing import TYPE_CHECKING, Any
 from rosbags.interfaces import Qos
 
 from tactile_resonance.counted import counted
-from tactile_resonance.files import write_whole
-from tactile_resonance.recording.stored_file import sync_folder
+from tactile_resonance.files import sync, write_whole
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.messages import definition_and_hash, message_types
 from tactile_resonance.scan.point_file import (
@@ -51,26 +50,24 @@ from tactile_resonance.scan.point_result import (
     TOPIC,
     TYPE,
     PointResult,
+    ResultsFile,
     serialised,
 )
-from tactile_resonance.scan.results_file import ResultsFile
 from tactile_resonance.scan.run_content import (
     CHECKSUM,
     FORMAT,
+    INDEX,
     PLAN_DAMAGED,
     POINT_FILE,
     RECORDING,
     SCENE,
     RunContent,
-    checksum_of,
-    in_order,
-    read_run,
-)
-from tactile_resonance.scan.run_index import (
-    INDEX,
     append_entry,
+    checksum_of,
     entry_of,
-    read_entries,
+    in_order,
+    read_index,
+    read_run,
     write_entries,
 )
 from tactile_resonance.scan.scan_point import ScanPoint
@@ -161,8 +158,7 @@ class RunDirectory:
             write_whole(path / SCENE, scene.encode())
             write_entries(path, [entry_of(path / SCENE, SCENE)])
             write_whole(path / "run.json", text)  # last: with it the run exists
-            sync_folder(path)
-            sync_folder(path.parent)
+            sync(path.parent)
             return cls(path, lock, read_run(path))
         except BaseException:
             os.close(lock)
@@ -265,7 +261,6 @@ class RunDirectory:
         """Add the next point of a scan that chooses them, durably; returns it."""
         content = replace(self._opened, points=(*self._points, point))
         write_whole(self.path / "run.json", _plan_text(content))
-        sync_folder(self.path)
         self._points.append(point)
         return point
 
@@ -412,7 +407,7 @@ def _other_definitions(content: RunContent) -> list[str]:
 
 def _mend_index(path: Path) -> None:
     """Remove what an interruption left at the end: part of a line, or one whose file never got its name."""
-    entries, index = read_entries(path), path / INDEX
+    (entries, _), index = read_index(path), path / INDEX
     last = next(reversed(entries), None)
     if last is not None and not (path / last).exists():
         del entries[last]

@@ -311,7 +311,7 @@ class ScanRunner:
         silent = name == SILENT
         if not (self._hands.free_air or silent):
             return
-        if any(f"-{name}." in file.name for file in self._run.content.files):
+        if self._run.content.paths(reference=name):
             return
         # phases and, on the bench, noise of its own: equal ones would hide how far the two may differ
         point = air_point(self._plan.most_points + (name == AFTER))

@@ -21,7 +21,7 @@ from tactile_resonance.scan.map_messages import POINT, cloud_message
 from tactile_resonance.scan.messages import header_message
 from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result, with_poles
-from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.point_result import PointOutcome, PointResult, as_csv
 from tactile_resonance.scan.pole_map import (
     SAME_PLACE_M,
     EllipseScale,
@@ -29,7 +29,6 @@ from tactile_resonance.scan.pole_map import (
     MapPoint,
     PoleMap,
 )
-from tactile_resonance.scan.results_file import as_csv
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
 from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalContact
 

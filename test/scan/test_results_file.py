@@ -7,8 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.scan.point_result import BandResult
-from tactile_resonance.scan.results_file import ResultsFile, as_csv
+from tactile_resonance.scan.point_result import BandResult, ResultsFile, as_csv
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from run_tables import result

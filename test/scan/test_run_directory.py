@@ -22,8 +22,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.point_file import offered_qos, read_content
-from tactile_resonance.scan.point_result import COLUMNS, PointKind, PointOutcome
-from tactile_resonance.scan.results_file import as_csv
+from tactile_resonance.scan.point_result import COLUMNS, PointKind, PointOutcome, as_csv
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, expected_bytes
 from tactile_resonance.scan.scene import Output

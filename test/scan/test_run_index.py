@@ -14,9 +14,8 @@ from rosbags.rosbag2 import Reader, ReaderError
 from tactile_resonance.scan import point_file
 from tactile_resonance.scan.point_result import PointKind
 from tactile_resonance.scan.recorded import recorded_results
-from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.run_content import INDEX, crc32_of, read_run
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.run_index import INDEX, crc32_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from run_tables import RECORD, START_NS, assert_same, plan, record_cdr, record_point, result
