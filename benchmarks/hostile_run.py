@@ -13,9 +13,9 @@ from tactile_resonance.multisine import design_multisine
 from tactile_resonance.scan.kept_bins import bins_of_point, keep_bins
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.recorded import EXCITATION, RECORD
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.scan_point import ScanPoint
 
 POINTS, PERIODS, SAMPLES, RATE_HZ = 3, 3, 400, 2000.0
 BAND_HZ = (200.0, 300.0)

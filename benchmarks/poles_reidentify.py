@@ -15,9 +15,9 @@ from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_P
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.rows_file import Rows, RowsWriter
 from tactile_resonance.scan.kept_bins import NAME, BinsKind, finish, kept_bins
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.reidentify import reidentify
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.scan_point import ScanPoint
 
 POINTS = 1_000_000
 DIFFERENT = 20_000

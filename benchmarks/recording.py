@@ -16,8 +16,8 @@ import numpy as np
 
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.scan_point import ScanPoint
 
 TYPE = "tactile_resonance/msg/Record"
 SAMPLES, MESSAGES = 40_000, 8

@@ -15,8 +15,8 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.adaptive import Adaptive, WantedBoundary
 from tactile_resonance.scan.kriging import KrigedSurface, krige
 from tactile_resonance.scan.level_set import LevelSet, difference_m2
-from tactile_resonance.scan.patterns import grid
 from tactile_resonance.scan.plan import CONTACT_S, NEAR_CONTACT_S, TRAVEL_M_S
+from tactile_resonance.scan.points import grid
 from tactile_resonance.scan.standoff import NEAR_M
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over

@@ -42,9 +42,9 @@ from tactile_resonance.scan.hands import (
     Touch,
 )
 from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.protocols import TOPIC, TYPE, ProtocolRequest
 from tactile_resonance.scan.run_directory import PointRecording
-from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.standoff import STILL_M, Standoffs
 from tactile_resonance.scan.surface import Plane

@@ -25,8 +25,8 @@ from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.fields import build, check_above_zero, check_within, read_dataclass, require
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
-from tactile_resonance.scan.patterns import Pair, Places, grid, inside_polygon
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.points import Pair, Places, grid, inside_polygon
 from tactile_resonance.tissue.classify import TissueClass
 
 MOST_PLACES = 2500

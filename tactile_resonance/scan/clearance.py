@@ -24,7 +24,7 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits, Work
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.contact.tip_path import TipPath, TurningWay
 from tactile_resonance.contact.vectors import vector
-from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
+from tactile_resonance.scan.points import LeftOut, ScanPoint
 from tactile_resonance.scan.surface import Surface
 
 BEAM_PLACES = 32

@@ -19,9 +19,8 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import number, read_yaml, require
 from tactile_resonance.scan.notes import parse_notes
-from tactile_resonance.scan.patterns import require_near
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint, require_near
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.strict_yaml import dump_yaml
 from tactile_resonance.tissue.references import with_library

@@ -14,9 +14,9 @@ from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.measurement import MeasurementDesign
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.run_directory import PointRecording
-from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.standoff import Standoffs
 

@@ -23,7 +23,7 @@ from scipy.special import ndtr, ndtri, owens_t
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import known, require
 from tactile_resonance.scan.kriging import KrigedSurface, TiledSurface
-from tactile_resonance.scan.patterns import inside_polygon
+from tactile_resonance.scan.points import inside_polygon
 
 Lines = tuple[FloatArray, ...]
 PROBABILITY = 0.95

@@ -25,7 +25,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.scan.hands import PointDisturbed, PointFailed, Touch
 from tactile_resonance.scan.plan import tip_orientation
-from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
+from tactile_resonance.scan.points import LeftOut, ScanPoint
 from tactile_resonance.scan.surface import NormalRequest
 from tactile_resonance.scan.touch import fit_surface
 

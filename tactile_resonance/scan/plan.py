@@ -17,7 +17,7 @@ from tactile_resonance.scan.adaptive import known_points
 from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
 from tactile_resonance.scan.point_result import PointResult
-from tactile_resonance.scan.scan_point import LeftOut, ScanPoint
+from tactile_resonance.scan.points import LeftOut, ScanPoint
 from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.standoff import is_along, is_plane
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest

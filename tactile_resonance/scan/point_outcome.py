@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 
-from tactile_resonance.poles.result import Poles
+from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.decision import Decision
 from tactile_resonance.scan.hands import Measured
@@ -19,8 +19,8 @@ from tactile_resonance.scan.point_result import (
     band_results,
     mode_columns,
 )
-from tactile_resonance.scan.references import AirReference, relative_to_air
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint
+from tactile_resonance.scan.references import relative_to_air
 from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.tissue.classify import TissueClass, classify
 from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
@@ -55,7 +55,7 @@ def measured_result(
     scene: ScanScene,
     measured: Measured,
     decision: Decision,
-    air: AirReference | None = None,
+    air: MainMode | None = None,
 ) -> PointResult:
     """Result of an attempt that was measured; `FAILED` where there is no pole.
 
@@ -67,8 +67,8 @@ def measured_result(
     measured : Measured
     decision : Decision
         That ended the measurement.
-    air : AirReference or None
-        What the poles are compared with.
+    air : MainMode or None
+        In free air, with which the poles are compared.
     """
     poles = measured.poles
     result = with_poles(
@@ -81,8 +81,7 @@ def measured_result(
         age_s=measured.contact_age_s,
     )
     if air is not None:
-        relative = relative_to_air(result.estimate, result.covariance, air)
-        result = replace(result, **asdict(relative))
+        result = replace(result, **relative_to_air(result.estimate, result.covariance, air))
     return replace(
         result,
         outcome=PointOutcome.DONE if poles.main.found else PointOutcome.FAILED,

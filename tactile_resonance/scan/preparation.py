@@ -12,7 +12,7 @@ from tactile_resonance.scan.hands import PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.measurement import Skipped
 from tactile_resonance.scan.normal_search import find_normals
 from tactile_resonance.scan.plan import Plan, make_plan
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.surface import Plane, TouchRequest
 from tactile_resonance.scan.surface_search import find_surface
 

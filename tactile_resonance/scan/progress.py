@@ -9,8 +9,8 @@ from enum import Enum
 
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.hands import Interrupted
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.references import SensorHealth
-from tactile_resonance.scan.scan_point import ScanPoint
 
 
 class Phase(str, Enum):

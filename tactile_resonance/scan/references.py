@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.validity import Validity, check_in_air
-from tactile_resonance.poles.result import Poles
+from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE
@@ -23,49 +22,6 @@ SILENT, BEFORE, AFTER = "silent", "air-before", "air-after"
 _SIGNIFICANT = 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class AirReference:
-    """Poles of the sensor touching nothing.
-
-    Attributes
-    ----------
-    estimate : (2,) float
-        f0 [Hz] and damping ratio.
-    covariance : (2, 2) float
-        NaN where unknown.
-    """
-
-    estimate: FloatArray
-    covariance: FloatArray
-
-    @property
-    def std(self) -> FloatArray:
-        """(2,) of f0 [Hz] and damping ratio."""
-        return np.sqrt(np.diag(self.covariance))
-
-
-@dataclass(frozen=True)
-class RelativeToAir:
-    """A pole against that of free air; uncertainties are of both.
-
-    Attributes
-    ----------
-    f0_shift_hz, f0_shift_std_hz : float
-        f0 less that in air [Hz].
-    f0_over_air, f0_over_air_std : float
-        f0 over that in air.
-    damping_shift, damping_shift_std : float
-        Damping ratio less that in air.
-    """
-
-    f0_shift_hz: float
-    f0_shift_std_hz: float
-    f0_over_air: float
-    f0_over_air_std: float
-    damping_shift: float
-    damping_shift_std: float
-
-
 class SensorHealth(str, Enum):
     """Whether the sensor has drifted between references."""
 
@@ -74,18 +30,17 @@ class SensorHealth(str, Enum):
     DRIFTED = "drifted"
 
 
-def reference_of(poles: Poles) -> AirReference | None:
-    """Reference of poles measured in air; None where there is no pole."""
-    mode = poles.main
-    return AirReference(mode.estimate, mode.covariance) if mode.found else None
-
-
 def relative_to_air(
-    estimate: FloatArray, covariance: FloatArray, air: AirReference
-) -> RelativeToAir:
+    estimate: FloatArray, covariance: FloatArray, air: MainMode
+) -> dict[str, float]:
     """Compare f0 [Hz] and damping ratio (2,) of covariance (2, 2) with those in air.
 
     The two measurements are independent: variances add, those of the ratio to first order.
+
+    Returns
+    -------
+    dict
+        By the names of their fields in `PointResult`.
     """
     shift = estimate - air.estimate
     std = np.sqrt(np.diag(covariance) + np.diag(air.covariance))
@@ -93,18 +48,18 @@ def relative_to_air(
     relative = np.sqrt(
         covariance[0, 0] / estimate[0] ** 2 + air.covariance[0, 0] / air.estimate[0] ** 2
     )
-    return RelativeToAir(
-        float(shift[0]),
-        float(std[0]),
-        float(ratio),
-        float(ratio * relative),
-        float(shift[1]),
-        float(std[1]),
-    )
+    return {
+        "f0_shift_hz": float(shift[0]),
+        "f0_shift_std_hz": float(std[0]),
+        "f0_over_air": float(ratio),
+        "f0_over_air_std": float(ratio * relative),
+        "damping_shift": float(shift[1]),
+        "damping_shift_std": float(std[1]),
+    }
 
 
 def judge_drift(
-    before: AirReference | None, after: AirReference | None, limits: DriftLimits
+    before: MainMode | None, after: MainMode | None, limits: DriftLimits
 ) -> tuple[SensorHealth, str]:
     """Whether the poles in air moved during the scan: beyond their uncertainty and beyond the limits.
 
@@ -138,8 +93,8 @@ def judge_drift(
     return SensorHealth.STEADY, f"sensor steady: {figures}"
 
 
-def read_reference(run: RunContent, name: str) -> AirReference | None:
-    """Reference of a run by its name, from the last poles of its file; None where there is none.
+def read_reference(run: RunContent, name: str) -> MainMode | None:
+    """Mode in air of a run's reference of a name, from the last poles of its file; None where there is none.
 
     Raises
     ------
@@ -147,7 +102,7 @@ def read_reference(run: RunContent, name: str) -> AirReference | None:
         If its file is damaged.
     """
     found = _poles_of(run, name)
-    return None if found is None else reference_of(found)
+    return found.main if found is not None and found.main.found else None
 
 
 def _poles_of(run: RunContent, name: str) -> Poles | None:

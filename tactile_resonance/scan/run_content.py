@@ -39,7 +39,7 @@ from tactile_resonance.scan.point_file import (
     topic_content,
 )
 from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, from_message
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint
 
 FORMAT = "tactile_resonance run 1"
 INDEX, RECORDING, SCENE = "index.jsonl", "recording", "scene.yaml"

@@ -53,6 +53,7 @@ from tactile_resonance.scan.point_result import (
     ResultsFile,
     serialised,
 )
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_content import (
     CHECKSUM,
     FORMAT,
@@ -70,7 +71,6 @@ from tactile_resonance.scan.run_content import (
     read_run,
     write_entries,
 )
-from tactile_resonance.scan.scan_point import ScanPoint
 
 if TYPE_CHECKING:
     from typing_extensions import Self

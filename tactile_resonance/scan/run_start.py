@@ -26,11 +26,11 @@ from tactile_resonance.scan.goal import (
 )
 from tactile_resonance.scan.hands import Check, Hands, Touch
 from tactile_resonance.scan.plan import Plan, plan_points
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.preparation import prepare
 from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, ended_by_storage, expected_bytes
-from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import ScanScene, read_run_scene
 from tactile_resonance.scan.standoff import Standoffs
 from tactile_resonance.sensor import sensor_named

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tactile_resonance.poles.result import Poles
+from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.scan.decision import (
     Decision,
     Separate,
@@ -36,18 +36,17 @@ from tactile_resonance.scan.hands import (
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.progress import Controls, Phase, Progress, Request, Summary
 from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.references import (
     AFTER,
     BEFORE,
     SILENT,
-    AirReference,
     read_reference,
     sensor_health,
 )
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory, ended_by_storage
-from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.scan.scene import OnFailure, Output
 from tactile_resonance.tissue.nominal_contact import ContactLoad
 
@@ -95,7 +94,7 @@ class ScanRunner:
         self._seed = seed
         self._durations_s, self._timed = 0.0, 0  # of points, and of how many
         self._disturbed: defaultdict[int, Disturbances] = defaultdict(Disturbances)
-        self._air: AirReference | None = None
+        self._air: MainMode | None = None
         self._left_s = NAN  # when the tip was free after the newest point
 
     def run(self) -> Summary:

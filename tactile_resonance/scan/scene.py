@@ -32,8 +32,8 @@ from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, PoleBand
 from tactile_resonance.scan.adaptive import Adaptive, read_adaptive
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.notes import Notes
-from tactile_resonance.scan.patterns import flat, read_positions, require_near
 from tactile_resonance.scan.period import residual_terms_of
+from tactile_resonance.scan.points import flat, read_positions, require_near
 from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.standoff import is_plane
 from tactile_resonance.scan.surface import (

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest
 
 NEAR_M = 0.01

@@ -12,7 +12,7 @@ import numpy as np
 
 from tactile_resonance.scan.hands import PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.plan import tip_orientation
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.surface import TouchRequest
 from tactile_resonance.scan.touch import TouchedSurface, fit_surface
 

@@ -19,7 +19,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import check_above_zero, check_within, number, require
 from tactile_resonance.scan.hands import Touch
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.scene import SensorUse
 from tactile_resonance.scan.surface import TouchRequest, check_search
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, find_surface, fit_touches

@@ -27,9 +27,9 @@ from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_result import POLES_TYPE, PointKind, PointResult
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.recorded import EXCITATION, RECORD
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import true_sensor
 from tactile_resonance.simulation.tissue.library import read_tissues

@@ -22,9 +22,9 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE, PointResult
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_content import file_of
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.scan_point import ScanPoint
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip
 from test.spinning import spin_until
 

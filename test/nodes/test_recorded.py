@@ -27,9 +27,9 @@ from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind
 from tactile_resonance.recording import messages
 from tactile_resonance.recording.store_recording import recording_of
 from tactile_resonance.scan.point_result import PointKind, PointResult
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.recorded import EXCITATION, RECORD, read_recorded
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.scan_point import ScanPoint
 
 START_NS = 1_700_000_000_000_000_000
 N, RATE_HZ = 2000, 5000.0

@@ -30,7 +30,7 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceEarly
 from tactile_resonance.scan.measurement import design_measurement
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.scene import Hold, ScanScene
 from tactile_resonance.scan.standoff import Standoffs
 from tactile_resonance.scan.surface import Plane

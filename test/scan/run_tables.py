@@ -9,8 +9,8 @@ import numpy as np
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_result import COLUMNS, PointKind, PointOutcome, PointResult
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.recorded import EXCITATION, RECORD
-from tactile_resonance.scan.scan_point import ScanPoint
 
 POLES = "tactile_resonance/msg/Poles"
 START_NS = 1_700_000_000_000_000_000

@@ -5,7 +5,7 @@ import copy
 import json
 import math
 import sys
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,14 @@ import pytest
 import yaml
 
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.run_report import pole_maps_of
 from tactile_resonance.scan.decision import BlockLimits, Precise
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal
 from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.notes import Notes
 from tactile_resonance.scan.progress import Controls
-from tactile_resonance.scan.references import AirReference, judge_drift
+from tactile_resonance.scan.references import judge_drift
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_start import start_run
 from tactile_resonance.scan.runner import ScanRunner
@@ -256,13 +257,16 @@ def observed(tmp_path, content):
     for result in results:
         for name in ("time_ns", "measurement_id"):
             del result[name]
-    air = (np.array([254.0, 0.03]), np.diag([1e-6, 1e-14]))
-    moved = AirReference(air[0] + [0.02, 2e-5], air[1])
+    air = np.array([254.0, 0.03])
+    air, moved = (
+        replace(Poles().main, estimate=estimate, covariance=np.diag([1e-6, 1e-14]))
+        for estimate in (air, air + [0.02, 2e-5])
+    )
     told = {
         "log": bench.log,
         "frame": bench.frame_in_base.vector.tolist(),
         "results": results,
-        "drift": judge_drift(AirReference(*air), moved, started.plan.scene.drift_limits),
+        "drift": judge_drift(air, moved, started.plan.scene.drift_limits),
         "maps": len(pole_maps_of(run)),
         "summary": summary.message,
         "found": {

@@ -11,9 +11,9 @@ from tactile_resonance.scan.map_messages import POINT
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_file import read_content, read_messages
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.scan.scan_point import ScanPoint
 
 TABLE_IN_BASE = [0.3, -0.1, 0.05, 0.0, 0.0, np.pi / 2]
 TIP = Rotation.from_rotvec([0.1, 0.2, -0.3])

@@ -13,7 +13,6 @@ from tactile_resonance.fields import read_dataclass
 from tactile_resonance.multisine import Grid
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.measurement import design_measurement
-from tactile_resonance.scan.patterns import grid, inside_polygon, read_positions, spiral
 from tactile_resonance.scan.plan import (
     CONTACT_S,
     NEAR_CONTACT_S,
@@ -21,7 +20,7 @@ from tactile_resonance.scan.plan import (
     make_plan,
     tip_orientation,
 )
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint, grid, inside_polygon, read_positions, spiral
 from tactile_resonance.scan.scene import Output, ScanScene
 from tactile_resonance.scan.surface import HeightField, Plane, TouchRequest
 

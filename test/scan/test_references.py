@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poles against free air, the sensor's drift, and notes of a session."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.notes import Notes, parse_notes
-from tactile_resonance.scan.references import (
-    AirReference,
-    SensorHealth,
-    judge_drift,
-    relative_to_air,
-)
+from tactile_resonance.scan.references import SensorHealth, judge_drift, relative_to_air
 from tactile_resonance.scan.scene import DriftLimits
 
 LIMITS = DriftLimits(f0_hz=0.05, damping_ratio=5e-5)
 
 
 def reference(f0_hz=246.6, damping_ratio=0.012, f0_std_hz=0.002, damping_std=4e-6):
-    return AirReference(np.array([f0_hz, damping_ratio]), np.diag([f0_std_hz**2, damping_std**2]))
+    return mode(np.array([f0_hz, damping_ratio]), np.diag([f0_std_hz**2, damping_std**2]))
+
+
+def mode(estimate, covariance):
+    return replace(Poles().main, estimate=estimate, covariance=covariance)
 
 
 def test_uncertainty_relative_to_air_is_that_of_both():
@@ -29,22 +31,22 @@ def test_uncertainty_relative_to_air_is_that_of_both():
         relative_to_air(
             mean + rng.standard_normal(2) * np.sqrt(np.diag(covariance)),
             covariance,
-            AirReference(air.estimate + rng.standard_normal(2) * air.std, air.covariance),
+            mode(air.estimate + rng.standard_normal(2) * air.std, air.covariance),
         )
         for _ in range(n)
     ]
     stated = relative_to_air(mean, covariance, air)
-    assert stated.f0_shift_hz == pytest.approx(254.0 - 246.6)
-    assert stated.f0_over_air == pytest.approx(254.0 / 246.6)
-    assert stated.damping_shift == pytest.approx(0.022)
+    assert stated["f0_shift_hz"] == pytest.approx(254.0 - 246.6)
+    assert stated["f0_over_air"] == pytest.approx(254.0 / 246.6)
+    assert stated["damping_shift"] == pytest.approx(0.022)
     for value, std in (
         ("f0_shift_hz", "f0_shift_std_hz"),
         ("f0_over_air", "f0_over_air_std"),
         ("damping_shift", "damping_shift_std"),
     ):
-        scatter = np.std([getattr(d, value) for d in drawn])
+        scatter = np.std([d[value] for d in drawn])
         # the scatter of n draws is itself known to 1 / sqrt(2 n)
-        assert scatter == pytest.approx(getattr(stated, std), rel=4 / np.sqrt(2 * n))
+        assert scatter == pytest.approx(stated[std], rel=4 / np.sqrt(2 * n))
 
 
 @pytest.mark.parametrize(
@@ -82,7 +84,7 @@ def test_noise_alone_is_no_drift():
     healths = [
         judge_drift(
             *(
-                AirReference(r.estimate + rng.standard_normal(2) * r.std, r.covariance)
+                mode(r.estimate + rng.standard_normal(2) * r.std, r.covariance)
                 for r in (reference(), reference())
             ),
             limits,

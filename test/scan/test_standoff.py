@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from tactile_resonance.scan.scan_point import ScanPoint
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.standoff import LEAST_M, NEAR_M, Standoffs
 from tactile_resonance.scan.surface import HeightField, Plane, TouchRequest
 
