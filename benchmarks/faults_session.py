@@ -20,7 +20,7 @@ from benchmarks.faults_inject import FLOODED, HOPS, Hop
 from benchmarks.killed_scan import BLOCKS, UP_WITHIN_S, KilledScan
 from benchmarks.kills_reader import finished_points
 from tactile_resonance.processes import end_with_parent
-from tactile_resonance.scan.bench_truth import deviations, truths_of
+from tactile_resonance.report.point_details import deviations, truths_of
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import RunContent, read_run
 from tactile_resonance.simulation.plant.simulated_robot import order

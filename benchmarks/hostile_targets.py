@@ -31,17 +31,16 @@ from tactile_resonance.drivers.twist import read_twist_config
 from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.record import Channel, Record
-from tactile_resonance.recording.files import read_recording
+from tactile_resonance.recording.recording import read_recording
 from tactile_resonance.recording.stored_file import read_stored, write_stored
 from tactile_resonance.scan.kept_bins import NAME, kept_bins
 from tactile_resonance.scan.labels import read_labels
-from tactile_resonance.scan.mesh import read_stl
-from tactile_resonance.scan.notes import parse_notes
 from tactile_resonance.scan.point_file import read_content
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.run_content import read_run
-from tactile_resonance.scan.scene import read_scan_scene
-from tactile_resonance.scan.table_file import read_table
+from tactile_resonance.scan.scene import parse_notes, read_scan_scene
+from tactile_resonance.scan.surface import read_stl
+from tactile_resonance.scan.table_calibration import read_table
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.tissue.library import read_tissues

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_resonance.processes import end_with_parent
-from tactile_resonance.scan.bench_truth import deviations, truths_of
+from tactile_resonance.report.point_details import deviations, truths_of
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 

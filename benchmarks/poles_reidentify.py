@@ -13,8 +13,7 @@ import numpy as np
 
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.rows_file import Rows, RowsWriter
-from tactile_resonance.scan.kept_bins import NAME, BinsKind, finish, kept_bins
+from tactile_resonance.scan.kept_bins import NAME, BinsKind, Rows, RowsWriter, finish, kept_bins
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.reidentify import reidentify
 from tactile_resonance.scan.run_directory import RunDirectory

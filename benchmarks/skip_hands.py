@@ -16,6 +16,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan.clearance import Standoffs
 from tactile_resonance.scan.hands import Check, Measured, PointFailed, Touch
 from tactile_resonance.scan.measurement import MeasurementDesign, excitation_of
 from tactile_resonance.scan.messages import make_message, to_cdr
@@ -26,7 +27,6 @@ from tactile_resonance.scan.run_content import RunContent, read_run
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import Hold, Output, ScanScene, read_scan_scene
-from tactile_resonance.scan.standoff import Standoffs
 from tactile_resonance.scan.surface import Plane
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over

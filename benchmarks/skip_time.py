@@ -20,8 +20,8 @@ from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.scan.clearance import Standoffs
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.standoff import Standoffs
 from tactile_resonance.scan.surface import Plane
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.contact_bench import ContactBench

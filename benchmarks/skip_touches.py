@@ -13,11 +13,11 @@ from tqdm import tqdm
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.scan.adaptive import Adaptive, WantedBoundary
+from tactile_resonance.scan.clearance import NEAR_M
 from tactile_resonance.scan.kriging import KrigedSurface, krige
 from tactile_resonance.scan.level_set import LevelSet, difference_m2
 from tactile_resonance.scan.plan import CONTACT_S, NEAR_CONTACT_S, TRAVEL_M_S
 from tactile_resonance.scan.points import grid
-from tactile_resonance.scan.standoff import NEAR_M
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import read_tissues

@@ -17,7 +17,6 @@ import yaml
 
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.fields import cut, numbers, read_text, require
-from tactile_resonance.scan.table_file import read_table
 from tactile_resonance.simulation.plant.defaults import HOST, STALLS_S, TABLE_IN_BASE
 from tactile_resonance.strict_yaml import parse_yaml
 
@@ -298,7 +297,12 @@ def _robot(stated: Mapping[str, Parameters], mock: bool) -> str:
 def _table_or_file(text: str, base_frame: str) -> list[float]:
     """Six numbers as they stand, or of a file that `calibrate_table` wrote."""
     path = Path(text).expanduser()
-    return read_table(path, base_frame) if path.is_file() else _table(text)
+    if not path.is_file():
+        return _table(text)
+    # only here: a launch file without one loads no scans
+    from tactile_resonance.scan.table_calibration import read_table
+
+    return read_table(path, base_frame)
 
 
 def _table(value: object) -> list[float]:

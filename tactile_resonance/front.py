@@ -20,9 +20,8 @@ from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.recording.files import read_recording
-from tactile_resonance.recording.recording import Recording
-from tactile_resonance.recording.store_recording import read_store_recording, recording_of
+from tactile_resonance.recording.recording import Recording, read_recording
+from tactile_resonance.recording.store import read_store_recording, recording_of
 
 if TYPE_CHECKING:
     from tactile_resonance.scan.run_content import RunContent
@@ -53,7 +52,7 @@ def read_record(
         Use the first so many.
     **fields
         Of a file: names of its fields, `u` and `y`, and what overrides its content, ``sample_rate_hz``,
-        ``samples_per_period``, ``segments``, ``excited_harmonics``. See `recording.files.read_recording`.
+        ``samples_per_period``, ``segments``, ``excited_harmonics``. See `recording.recording.read_recording`.
 
     Raises
     ------

@@ -11,7 +11,7 @@ import yaml
 
 from tactile_resonance.bringup import NODES, plan_bringup, read_parameter_file, stated_for
 from tactile_resonance.processes import free_domain_id
-from tactile_resonance.scan.table_file import FORMAT
+from tactile_resonance.scan.table_calibration import FORMAT
 
 MOCK = {"use_mock_hardware": "true"}
 REAL = {

@@ -158,7 +158,7 @@ def take_domain(host: str) -> str:
 
 def _new_job(options: argparse.Namespace, scene: str, name: str) -> Job:
     from tactile_resonance.configuration import share_path
-    from tactile_resonance.scan.notes import parse_notes
+    from tactile_resonance.scan.scene import parse_notes
 
     parse_notes(options.notes, "--notes")
     require(1 <= options.seed <= 2**31, "--seed", options.seed, "1 to 2^31")

@@ -129,7 +129,7 @@ def _variance(output: Path) -> None:
 def _mechanics(output: Path) -> None:
     from tactile_resonance.mechanics.indentation import Protocol
     from tactile_resonance.report.drawing import save_figure
-    from tactile_resonance.report.mechanics_figure import draw_tests
+    from tactile_resonance.report.tissue_figures import draw_tests
     from tactile_resonance.scan.tissue_tests import fitted
     from tactile_resonance.sensor import sensor_named
     from tactile_resonance.simulation.plant.tissue_bench import indent_tissue

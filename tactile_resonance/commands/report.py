@@ -77,7 +77,6 @@ def report_run(folder: Path) -> int:
     from tactile_resonance.report.drawing import figure_bytes
     from tactile_resonance.report.map_recording import write_map_recording
     from tactile_resonance.report.point_details import details_of, truths_with
-    from tactile_resonance.report.point_table import point_table, table_notes
     from tactile_resonance.report.pole_map_figure import draw_pole_map
     from tactile_resonance.report.run_report import (
         as_page,
@@ -86,6 +85,7 @@ def report_run(folder: Path) -> int:
         skipped_lines,
         summary,
     )
+    from tactile_resonance.report.run_tables import point_table, table_notes
     from tactile_resonance.scan.plan_text import map_names
     from tactile_resonance.scan.run_content import not_checked
 

@@ -17,8 +17,7 @@ from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
-from tactile_resonance.recording.files import read_recording
-from tactile_resonance.recording.recording import Recording
+from tactile_resonance.recording.recording import Recording, read_recording
 from tactile_resonance.recording.store import StoredEntry, StoredMeasurement, list_measurements
 
 

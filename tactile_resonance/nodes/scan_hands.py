@@ -29,7 +29,7 @@ from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
 from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.scan.clearance import STILL_M, Standoffs, TipUse
 from tactile_resonance.scan.hands import (
     Check,
     Measured,
@@ -43,12 +43,11 @@ from tactile_resonance.scan.hands import (
 )
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.protocols import TOPIC, TYPE, ProtocolRequest
 from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scene import Hold
-from tactile_resonance.scan.standoff import STILL_M, Standoffs
 from tactile_resonance.scan.surface import Plane
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
+from tactile_resonance.scan.tissue_tests import TOPIC, TYPE, ProtocolRequest
 from tactile_resonance.sensor import sensor_named
 
 STREAM_TOPICS = ("record", "frf", "poles")

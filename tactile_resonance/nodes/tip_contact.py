@@ -32,9 +32,9 @@ from tactile_resonance.scan.hands import (
     SurfaceEarly,
     SurfaceMissing,
 )
-from tactile_resonance.scan.point_times import StateTimes
-from tactile_resonance.scan.protocols import ProtocolRequest
+from tactile_resonance.scan.point_outcome import StateTimes
 from tactile_resonance.scan.scene import Hold
+from tactile_resonance.scan.tissue_tests import ProtocolRequest
 
 STATE_TOPIC = "contact_state"
 HALF_WAY = re.compile(r"moving tissue: (\d+) um ")

@@ -45,37 +45,21 @@ POLES_STATUS = {
     PolesStatus.FAILED: 8,
     PolesStatus.TRUTH: 100,
 }
-# Fields of equal name in message and object.
+
+
+def _plain(kind: type) -> tuple[str, ...]:
+    """Fields of a dataclass that are numbers or texts: message and object name them alike."""
+    return tuple(each.name for each in fields(kind) if each.type in ("int", "float", "bool", "str"))
+
+
 ORIGIN = ("measurement_id", "excitation_id", "final", "label", "simulated")
-SPREAD = ("rms_n", "min_n", "max_n")  # of a contact's force
-EXCITATION = (
-    "measurement_id",
-    "excitation_id",
-    "realisation",
-    "realisations",
-    "periods",
-    "seed",
-    "sample_rate_hz",
-    "samples_per_period",
-    "random_phases",
-    "label",
-)
 EXCITATION_ARRAYS = ("harmonics", "amplitude_v", "phase_rad")
-RECORD = (
-    "realisation",
-    "block_index",
-    "sample_rate_hz",
-    "samples_per_period",
-    "channel_delay_s",
-    "anti_alias_filter",
-)
 POLES = ("lines", "cost", "expected_cost", "condition_number", "method", "message")
-BAND = ("low_hz", "high_hz", "order", "residual_terms")
-DISTORTION = tuple(each.name for each in fields(BandDistortion))
 POLES_ARRAYS = ("f0_hz", "damping_ratio")
 POLES_DRIFTS = ("f0_drift_hz_per_s", "damping_drift_per_s")
 POLES_COVARIANCES = ("covariance", "total_covariance", "drift_covariance")
-
+EXCITATION, RECORD, BAND = _plain(Excitation), _plain(Record), _plain(PoleBand)
+DISTORTION, SPREAD = _plain(BandDistortion), _plain(ForceSpread)
 E = TypeVar("E", bound=Enum)
 
 
@@ -101,10 +85,7 @@ def bands_from_message(message: Any) -> tuple[PoleBand, ...]:
 
 def write_bands(message: Any, make: Callable[[], Any], bands: Sequence[PoleBand]) -> None:
     """Fill the field ``bands`` with messages that `make` gives."""
-    for band in bands:
-        written = make()
-        _write_values(written, BAND, band)
-        message.bands.append(written)
+    _write_each(message.bands, make, BAND, bands)
 
 
 def write_excitation(
@@ -230,10 +211,7 @@ def write_distortion(
     message: Any, make: Callable[[], Any], distortion: Sequence[BandDistortion]
 ) -> None:
     """Fill the field ``distortion`` with messages that `make` gives."""
-    for band in distortion:
-        written = make()
-        _write_values(written, DISTORTION, band)
-        message.distortion.append(written)
+    _write_each(message.distortion, make, DISTORTION, distortion)
 
 
 def origin_from_message(message: Any) -> Origin:
@@ -397,3 +375,12 @@ def _write_values(message: Any, names: Iterable[str], source: object) -> None:
     for name in names:
         value = getattr(source, name)
         setattr(message, name, value.item() if isinstance(value, np.generic) else value)
+
+
+def _write_each(
+    target: list[Any], make: Callable[[], Any], names: Iterable[str], sources: Sequence[object]
+) -> None:
+    """Append a message of fields of equal name for each object."""
+    for source in sources:
+        target.append(make())
+        _write_values(target[-1], names, source)

@@ -16,8 +16,7 @@ from scipy.spatial import cKDTree
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.report import run_tables as tables
 from tactile_resonance.report.boundary import RunBoundary
-from tactile_resonance.report.page import page
-from tactile_resonance.report.page_data import HIGH, LOW, MM, listed, page_data
+from tactile_resonance.report.page import HIGH, LOW, MM, listed, page, page_data
 from tactile_resonance.report.point_details import PointDetails
 from tactile_resonance.report.run_report import (
     median_std,

@@ -16,15 +16,13 @@ from typing import Any
 
 from tactile_resonance.fields import known
 from tactile_resonance.poles.result import Poles
-from tactile_resonance.report.page_data import (
+from tactile_resonance.report.page import (
     MN,
-    frf_entry,
     listed,
     map_entry,
     point_entry,
-    poles_entries,
 )
-from tactile_resonance.report.point_details import MOST_DETAILED, force_entry
+from tactile_resonance.report.point_details import MOST_DETAILED, PointDetails
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult, mode_columns
 from tactile_resonance.scan.pole_map import GrowingMap
 
@@ -62,12 +60,7 @@ class _Measuring:
 
     def entry(self, force: list[tuple[float, float]]) -> dict[str, Any]:
         """What a click on its point shows."""
-        return {
-            "frf": None if self.frf is None else frf_entry(self.frf, self.poles, _LINES),
-            "poles": [] if self.poles is None else poles_entries(self.poles),
-            "force": force_entry(force),
-            "truth": None,
-        }
+        return PointDetails(self.frf, self.poles, tuple(force)).entry(_LINES)
 
 
 class LiveRun:

@@ -17,8 +17,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
-from tactile_resonance.report.page import content_security_policy, page
-from tactile_resonance.report.page_data import as_json, page_data
+from tactile_resonance.report.page import as_json, content_security_policy, page, page_data
 
 if TYPE_CHECKING:
     from typing_extensions import Self

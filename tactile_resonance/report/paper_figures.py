@@ -19,9 +19,9 @@ from tactile_resonance.frf.distortion import DetectionLines, estimate_distortion
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.recording.messages import array_of, complex_of
 from tactile_resonance.recording.recording import Recording
-from tactile_resonance.recording.store_recording import recording_of
+from tactile_resonance.recording.store import recording_of
 from tactile_resonance.report.drawing import PROBABILITY, decibel, ellipse
-from tactile_resonance.report.page_data import listed, s_plane
+from tactile_resonance.report.page import listed, s_plane
 from tactile_resonance.report.point_details import FRF_TYPE, PointDetails
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import PointResult

@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.poles.result import Poles, PolesStatus
+from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.report.page_data import (
+from tactile_resonance.report.page import (
     MN,
     frf_entry,
     listed,
@@ -19,15 +21,12 @@ from tactile_resonance.report.page_data import (
     pole_entry,
     poles_entries,
 )
-from tactile_resonance.scan.bench_truth import PointTruth, truth_of_point, truths_of
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
-from tactile_resonance.scan.protocols import TYPE as TEST_TYPE
 from tactile_resonance.scan.recorded import EXCITATION
 from tactile_resonance.scan.run_content import RunContent, file_of
-
-if TYPE_CHECKING:
-    from tactile_resonance.scan.tissue_tests import TissueTest
+from tactile_resonance.scan.tissue_tests import TYPE as TEST_TYPE
+from tactile_resonance.scan.tissue_tests import TissueTest, fits_at
 
 FRF_TYPE = "tactile_resonance/msg/FRF"
 STATE_TYPE = "tactile_resonance/msg/ContactState"
@@ -38,6 +37,8 @@ MOST_TESTED = 100
 _LINES_OF_A_PAGE = 60_000  # of all FRFs together
 _LINES_OF_A_POINT = 600
 _MOST_FORCES = 400  # of a point: 16 s of the topic
+SAME_MIDDLE_NS = 50_000_000
+"""Between the middles of an estimate and of its truth, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,25 +70,18 @@ class PointDetails:
 
     def entry(self, most_lines: int) -> dict[str, Any]:
         """As the page shows it, with so many lines of the FRF at the most."""
+        force, truth = np.asarray(self.force, float).reshape(-1, 2), None
+        if self.truth is not None:
+            f0_hz, damping = self.truth.estimate
+            unknown = np.full((2, 2), np.nan)
+            truth = {**pole_entry(f0_hz, damping, unknown), "tissue": self.truth.tissue}
         return {
             "frf": None if self.frf is None else frf_entry(self.frf, self.poles, most_lines),
             "poles": [] if self.poles is None else poles_entries(self.poles),
-            "force": force_entry(self.force),
-            "truth": None if self.truth is None else truth_entry(self.truth),
+            "force": {"t_s": listed(force[:, 0], 5), "force_mn": listed(MN * force[:, 1], 5)},
+            "truth": truth,
             "tests": [mechanics_entry(one) for one in self.tests],
         }
-
-
-def force_entry(force: Sequence[tuple[float, float]]) -> dict[str, Any]:
-    """Times [s] and forces [mN] of pairs of s and N."""
-    rows = np.asarray(force, float).reshape(-1, 2)
-    return {"t_s": listed(rows[:, 0], 5), "force_mn": listed(MN * rows[:, 1], 5)}
-
-
-def truth_entry(truth: PointTruth) -> dict[str, Any]:
-    """What the simulated bench knew of a point."""
-    f0_hz, damping = truth.estimate
-    return {**pole_entry(f0_hz, damping, np.full((2, 2), np.nan)), "tissue": truth.tissue}
 
 
 def detailed(results: Sequence[PointResult], most: int = MOST_DETAILED) -> list[PointResult]:
@@ -117,9 +111,6 @@ def details_of(run: RunContent, most: int = MOST_DETAILED) -> dict[int, PointDet
         try:
             found[result.index] = read_details(run, result)
             if result.index in with_tests:
-                # only here: what is compiled for the fits takes a second to load
-                from tactile_resonance.scan.tissue_tests import fits_at
-
                 tests = fits_at(run, result)
                 found[result.index] = replace(found[result.index], tests=tests)
         except ValueError as error:
@@ -163,3 +154,92 @@ def read_details(run: RunContent, result: PointResult) -> PointDetails:
     truth = truth_of_point(told, result) if result.simulated else None
     step = 1 + len(force) // _MOST_FORCES
     return PointDetails(frf, poles, tuple(force[::step]), truth)
+
+
+@dataclass(frozen=True, eq=False)
+class PointTruth:
+    """The true mode of one point, the mean over its measurement: contacts creep.
+
+    Attributes
+    ----------
+    estimate : (2,) float
+        f0 [Hz] and damping ratio.
+    tissue : str
+        Under the tip.
+    force_n, force_rms_n : float
+        Mean, and root mean square of its motion over parts of 40 ms [N].
+    """
+
+    estimate: FloatArray
+    tissue: str
+    force_n: float
+    force_rms_n: float
+
+
+def truths_of(run: RunContent, known: Container[int] = ()) -> dict[int, PointTruth]:
+    """Truth of the latest attempts, by point; empty for a run on hardware.
+
+    Parameters
+    ----------
+    run : RunContent
+    known : container of int
+        Points that are left out.
+
+    Raises
+    ------
+    ValueError
+        If a file is damaged.
+    """
+    truths, told_at = {}, run.messages_at(POLES_TYPE)
+    for result in run.latest:
+        done = result.simulated and result.outcome is PointOutcome.DONE
+        if not done or result.index in known or result.index not in told_at:
+            continue
+        messages = read_messages_of_type(file_of(run.path, result), POLES_TYPE)
+        told = [poles_from_message(message) for _, _, message in messages]
+        if truth := truth_of_point(told, result):
+            truths[result.index] = truth
+    return truths
+
+
+def deviations(results: Iterable[PointResult], truths: Mapping[int, PointTruth]) -> FloatArray:
+    """(n, 2) estimate less truth of f0 and damping ratio in standard deviations, where both are known."""
+    rows = [deviation(r, truths[r.index]) for r in results if r.index in truths]
+    return np.array(rows).reshape(-1, 2)
+
+
+def deviation(result: PointResult, truth: PointTruth) -> FloatArray:
+    """(2,) estimate less truth in standard deviations of the point."""
+    return (result.estimate - truth.estimate) / np.sqrt(np.diag(result.covariance))
+
+
+def truth_of_point(
+    poles_and_truths: Iterable[tuple[Poles, Origin]], result: PointResult
+) -> PointTruth | None:
+    """The bench's truth over the blocks that the last poles rest on; its mode nearest to the estimate.
+
+    Parameters
+    ----------
+    poles_and_truths : iterable of (Poles, Origin)
+        All that the file of an attempt holds, in order.
+    result : PointResult
+        Of the attempt.
+    """
+    told, middle_ns = [], 0
+    for poles, origin in poles_and_truths:
+        if origin.measurement_id != result.measurement_id:
+            continue
+        if poles.status is PolesStatus.TRUTH:
+            told.append((poles, origin))
+        else:
+            middle_ns = origin.time_ns
+    if not told:
+        return None
+    # the bench may have played on
+    poles, origin = min(told, key=lambda each: abs(each[1].time_ns - middle_ns))
+    if abs(origin.time_ns - middle_ns) > SAME_MIDDLE_NS:
+        return None
+    k = int(np.argmin(np.abs(poles.f0_hz - result.f0_hz)))
+    estimate = np.array([poles.f0_hz[k], poles.damping_ratio[k]])
+    contact = origin.contact
+    return PointTruth(estimate, origin.label, contact.force_n, contact.spread.rms_n)

@@ -16,20 +16,18 @@ import yaml
 from tactile_resonance.counted import counted
 from tactile_resonance.report import run_tables as tables
 from tactile_resonance.report.drawing import SIMULATED
-from tactile_resonance.report.page import page
-from tactile_resonance.report.page_data import map_entry, page_data, point_entry
+from tactile_resonance.report.page import map_entry, page, page_data, point_entry
 from tactile_resonance.report.paper_figures import paper_figures
 from tactile_resonance.report.point_details import PointDetails, lines_each
-from tactile_resonance.report.point_table import SURE, repeats_sentence, table_notes
-from tactile_resonance.report.run_tables import Truths
+from tactile_resonance.report.run_tables import SURE, Truths, repeats_sentence, table_notes
+from tactile_resonance.scan.point_outcome import budget_sentence
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.point_times import budget_sentence
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
-from tactile_resonance.scan.protocols import TYPE as TEST_TYPE
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import RunContent, not_checked
 from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
+from tactile_resonance.scan.tissue_tests import TYPE as TEST_TYPE
 from tactile_resonance.silent import SilentRecord, silent_record
 from tactile_resonance.strict_yaml import parse_yaml
 from tactile_resonance.tissue.classify import UNKNOWN

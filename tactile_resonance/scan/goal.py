@@ -18,10 +18,9 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import number, read_yaml, require
-from tactile_resonance.scan.notes import parse_notes
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
-from tactile_resonance.scan.points import ScanPoint, require_near
-from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
+from tactile_resonance.scan.points import require_near, scan_points
+from tactile_resonance.scan.scene import ScanScene, parse_notes, parse_scan_scene
 from tactile_resonance.strict_yaml import dump_yaml
 from tactile_resonance.tissue.references import with_library
 
@@ -138,8 +137,11 @@ def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
     text = dump_yaml(content)
     if goal.scene and not (changes or named):
         text = path.read_text(encoding="utf-8")
-    plan = plan_points(scene, _points(poses, scene.name)) if len(poses) else make_plan(scene)
-    return WantedScan(plan, text)
+    if not len(poses):
+        return WantedScan(make_plan(scene), text)
+    normals = Rotation.from_quat(poses[:, 3:]).apply([0.0, 0.0, 1.0])  # (n, 3)
+    points = scan_points(scene.name, poses[:, :3], normals, poses[:, 3:])
+    return WantedScan(plan_points(scene, points), text)
 
 
 def resumed_run(goal: ScanGoal) -> Path:
@@ -220,20 +222,6 @@ def _poses_in_scene(goal: ScanGoal, frame_id: str, place: Pose, frames: Frames) 
         poses = np.concatenate([places, turns], axis=1)
     require_near(poses[:, :3], "poses")
     return poses
-
-
-def _points(poses: FloatArray, name: str) -> tuple[ScanPoint, ...]:
-    normals = Rotation.from_quat(poses[:, 3:]).apply([0.0, 0.0, 1.0])  # (n, 3)
-    return tuple(
-        ScanPoint(
-            index,
-            tuple(pose[:3].tolist()),
-            tuple(normal.tolist()),
-            tuple(pose[3:].tolist()),
-            f"{name}, point {index + 1}",
-        )
-        for index, (pose, normal) in enumerate(zip(poses, normals, strict=True))
-    )
 
 
 class GoalFiles:

@@ -13,12 +13,12 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Origin
+from tactile_resonance.scan.clearance import Standoffs
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.run_directory import PointRecording
 from tactile_resonance.scan.scene import Hold
-from tactile_resonance.scan.standoff import Standoffs
+from tactile_resonance.scan.tissue_tests import ProtocolRequest
 
 ATTEMPTS = 6  # at what is disturbed: a point, a reference, a touch
 # A point that lost its node is repeated when the node is back, so often at most: it may be what ends the node.

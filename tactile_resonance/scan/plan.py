@@ -8,18 +8,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.counted import counted
 from tactile_resonance.scan.adaptive import known_points
-from tactile_resonance.scan.clearance import TipUse, clear_points
+from tactile_resonance.scan.clearance import TipUse, clear_points, is_along, is_plane
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
 from tactile_resonance.scan.point_result import PointResult
-from tactile_resonance.scan.points import LeftOut, ScanPoint
+from tactile_resonance.scan.points import (
+    LeftOut,
+    ScanPoint,
+    point_label,
+    scan_points,
+    tip_orientation,
+)
 from tactile_resonance.scan.scene import ScanScene
-from tactile_resonance.scan.standoff import is_along, is_plane
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest
 
 STEEPEST_RAD = np.pi / 3
@@ -56,9 +59,8 @@ class Plan:
         count = self.most_points
         each = [replace(left, saved_s=left.saved_s * count) for left in self.measurement.skipped]
         if near := self.near:
-            what = (
-                f"rest for the tare, and height that the surface does not ask for, at {counted(near, 'point')}"
-            )
+            at = counted(near, "point")
+            what = f"rest for the tare, and height that the surface does not ask for, at {at}"
             why = "zero and plane are known from the point before"
             each.append(Skipped(what, why, near * (CONTACT_S - NEAR_CONTACT_S)))
         return (*self.left_out, *each)
@@ -142,7 +144,7 @@ class Plan:
         return np.array([point.position_m[:2] for point in self.points])
 
     def _numbered(self, point: ScanPoint, index: int) -> ScanPoint:
-        return replace(point, index=index, label=f"{self.scene.name}, point {index + 1}")
+        return replace(point, index=index, label=point_label(self.scene.name, index))
 
     def with_points(self, points: Sequence[ScanPoint], left: Sequence[LeftOut]) -> Plan:
         """The same with these points, renumbered, and what is left out of it noted.
@@ -206,18 +208,7 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
     turns = tip_orientation(normals[kept], scene.sensor.heading_rad)
     std = surface.height_std_m(xy[kept])
     where = np.column_stack([xy[kept], z[kept]])
-    points = tuple(
-        ScanPoint(
-            index,
-            tuple(where[index].tolist()),
-            tuple(normals[kept][index].tolist()),
-            tuple(turns[index].tolist()),
-            f"{scene.name}, point {index + 1}",
-            float(std[index]),
-        )
-        for index in range(len(where))
-    )
-    plan = plan_points(scene, points)
+    plan = plan_points(scene, scan_points(scene.name, where, normals[kept], turns, std))
     each_s = CONTACT_S + plan.measurement.blocks.most * plan.measurement.block_s
     left_out = tuple(
         Skipped(counted(int(left.sum()), "point"), why, float(left.sum() * each_s))
@@ -240,33 +231,3 @@ def _expected_surface(scene: ScanScene) -> Surface:
 def _in_mm(point: ScanPoint) -> str:
     x, y, _ = point.position_m
     return f"x = {1e3 * x:.2f}, y = {1e3 * y:.2f} mm"
-
-
-def tip_orientation(normal: npt.ArrayLike, heading_rad: float) -> FloatArray:
-    """(..., 4) unit quaternions (x, y, z, w) of the frame `tip`.
-
-    Parameters
-    ----------
-    normal : (..., 3) float
-        Outward unit normals: the tip's +z.
-    heading_rad : float
-        Direction of the tip's +x, from clamp to tip, seen from above [rad]: +x is its projection onto the
-        surface.
-
-    Raises
-    ------
-    ValueError
-        If a normal points along the heading.
-    """
-    z = np.asarray(normal, float)
-    heading = np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
-    x = heading - np.sum(z * heading, axis=-1, keepdims=True) * z
-    length = np.linalg.norm(x, axis=-1, keepdims=True)
-    if not np.all(length > 1e-6):
-        raise ValueError(
-            f"heading_rad: got {heading_rad:g}, along a normal; accepted is across all of them"
-        )
-    x = x / length
-    frame = np.stack([x, np.cross(z, x), z], axis=-1)  # (..., 3, 3), columns are the axes
-    quaternions = Rotation.from_matrix(frame.reshape(-1, 3, 3)).as_quat()
-    return np.asarray(quaternions.reshape(*z.shape[:-1], 4))

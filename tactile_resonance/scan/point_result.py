@@ -299,6 +299,7 @@ class ResultsFile:
 
     def __init__(self, folder: Path, results: Sequence[PointResult] = ()) -> None:
         self._path = folder / RESULTS
+        self._last, self._columns = -1, list[str]()
         self._write(results)
 
     def add(self, result: PointResult, latest: Callable[[], Sequence[PointResult]]) -> None:

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where to touch: a point of a plan, and patterns of points seen from above (grid, spiral, region ...)."""
+"""Where to touch: points of a plan, and patterns of them seen from above (grid, spiral, region ...)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import build, check_above_zero, number, numbers, one_of, require
@@ -51,13 +52,6 @@ class ScanPoint:
     def __post_init__(self) -> None:
         require(self.index >= 0, "index", self.index, "0 or above")
 
-    def as_json(self) -> dict[str, Any]:
-        """Plain values; `fields.read_dataclass` takes them back without loss."""
-        return {
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in asdict(self).items()
-        }
-
 
 @dataclass(frozen=True)
 class LeftOut:
@@ -65,6 +59,57 @@ class LeftOut:
 
     point: ScanPoint
     why: str
+
+
+def scan_points(
+    name: str,
+    position_m: FloatArray,
+    normal: FloatArray,
+    orientation_xyzw: FloatArray,
+    height_std_m: FloatArray | None = None,
+) -> tuple[ScanPoint, ...]:
+    """Points of a scene of a name, numbered: fields of `ScanPoint`, a row each."""
+    std_m = np.zeros(len(position_m)) if height_std_m is None else height_std_m
+    columns = [each.tolist() for each in (position_m, normal, orientation_xyzw, std_m)]
+    return tuple(
+        ScanPoint(k, tuple(place), tuple(across), tuple(turn), point_label(name, k), std)
+        for k, (place, across, turn, std) in enumerate(zip(*columns, strict=True))
+    )
+
+
+def point_label(name: str, index: int) -> str:
+    """Of a point of a scene, for people, who count from 1."""
+    return f"{name}, point {index + 1}"
+
+
+def tip_orientation(normal: npt.ArrayLike, heading_rad: float) -> FloatArray:
+    """(..., 4) unit quaternions (x, y, z, w) of the frame `tip`.
+
+    Parameters
+    ----------
+    normal : (..., 3) float
+        Outward unit normals: the tip's +z.
+    heading_rad : float
+        Direction of the tip's +x, from clamp to tip, seen from above [rad]: +x is its projection onto the
+        surface.
+
+    Raises
+    ------
+    ValueError
+        If a normal points along the heading.
+    """
+    z = np.asarray(normal, float)
+    heading = np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
+    x = heading - np.sum(z * heading, axis=-1, keepdims=True) * z
+    length = np.linalg.norm(x, axis=-1, keepdims=True)
+    if not np.all(length > 1e-6):
+        raise ValueError(
+            f"heading_rad: got {heading_rad:g}, along a normal; accepted is across all of them"
+        )
+    x = x / length
+    frame = np.stack([x, np.cross(z, x), z], axis=-1)  # (..., 3, 3), columns are the axes
+    quaternions = Rotation.from_matrix(frame.reshape(-1, 3, 3)).as_quat()
+    return np.asarray(quaternions.reshape(*z.shape[:-1], 4))
 
 
 def grid(

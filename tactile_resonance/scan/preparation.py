@@ -1,20 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scan does before its first point: surface and normals found by touch, what is not clear left out."""
+"""What a scan does before its first point: surface and normals found by touch, what is not clear left out.
+
+To find the normal at a point the ball comes down along the normal as it is expected, at places of one circle
+about the point, evenly apart. Where its centre is at first touch lies on the surface offset by its radius,
+whose normals are those of the surface. The plane through the centres, fitted by least squares in the frame of
+the expected normal, has the normal that is sought.
+
+What three touches make of curvature: on an offset surface of radii R1 and R2 (those of the surface plus the
+ball's radius where it bulges, less it where it is hollow) and a circle of radius p, the normal is off by up to
+``p |1 / R1 - 1 / R2| / 4``: nothing on a sphere that is met along its normal, 0.04 rad on a cylinder of 10 mm
+and a circle of 2 mm. Four touches or more leave nothing of that, and check each other.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
+from tactile_resonance._typing import FloatArray
+from tactile_resonance.fields import require
 from tactile_resonance.scan.clearance import TipUse
-from tactile_resonance.scan.hands import PointFailed, ScanEnded, Touch
+from tactile_resonance.scan.hands import PointDisturbed, PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.measurement import Skipped
-from tactile_resonance.scan.normal_search import find_normals
 from tactile_resonance.scan.plan import Plan, make_plan
-from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.surface import Plane, TouchRequest
-from tactile_resonance.scan.surface_search import find_surface
+from tactile_resonance.scan.points import LeftOut, ScanPoint, tip_orientation
+from tactile_resonance.scan.surface import NormalRequest, Plane, TouchRequest
+from tactile_resonance.scan.surface_search import find_surface, fit_surface
 
 UNCHECKED = Skipped(
     "the check that the housing is clear of the surface",
@@ -91,3 +106,156 @@ def prepare(
     facts["normals"] = [normal.as_json() for normal in normals]
     plan = plan.with_points([normal.point for normal in normals], left)
     return plan.clear_of(surface, use), facts
+
+
+@dataclass(frozen=True, eq=False)
+class FoundNormal:
+    """A normal and the touches it rests on.
+
+    Attributes
+    ----------
+    point : ScanPoint
+        With the normal found, where the ball touches the surface when it is straight above the point that was
+        asked for: beside that by the ball's radius times the sine of the angle.
+    std_rad : float
+        Standard deviation of the normal about the axis about which it is known least [rad].
+    angle_rad : float
+        Between it and the normal that was expected.
+    worst_m : float
+        Largest distance of a touch from the plane through all [m]; of three touches none is off.
+    touches : tuple of Touch
+    """
+
+    point: ScanPoint
+    std_rad: float
+    angle_rad: float
+    worst_m: float
+    touches: tuple[Touch, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """What a run keeps of it; lengths in metres."""
+        return {
+            "position_m": list(self.point.position_m),
+            "normal": list(self.point.normal),
+            "std_rad": self.std_rad,
+            "angle_rad": self.angle_rad,
+            "worst_m": self.worst_m,
+            "touches": [{"ball_m": list(t.ball_m), "std_m": t.std_m} for t in self.touches],
+        }
+
+
+def find_normals(
+    points: Iterable[ScanPoint],
+    request: NormalRequest,
+    ball_radius_m: float,
+    heading_rad: float,
+    touch: Callable[[ScanPoint], Touch],
+) -> tuple[tuple[FoundNormal, ...], tuple[LeftOut, ...]]:
+    """Touch around each point; those whose normal is not found, or is refused, are left out.
+
+    Parameters
+    ----------
+    points : iterable of ScanPoint
+    request : NormalRequest
+    ball_radius_m, heading_rad : float
+        Of the tip; direction of the beam, seen from above.
+    touch : callable
+        Touches a point of the surface as it is expected, along its normal; may raise `PointFailed`.
+
+    Raises
+    ------
+    PointDisturbed
+        That `touch` raised: it says nothing of the point.
+    """
+    found: list[FoundNormal] = []
+    left: list[LeftOut] = []
+    for point in points:
+        try:
+            touches = tuple(touch(around) for around in places_around(point, request))
+            normal = normal_of_touches(point, touches, ball_radius_m, heading_rad)
+            _require_good(normal, request)
+        except PointDisturbed:  # says nothing of the point
+            raise
+        except (PointFailed, ValueError) as error:
+            left.append(LeftOut(point, f"normals: {error}"))
+        else:
+            found.append(normal)
+    return tuple(found), tuple(left)
+
+
+def places_around(point: ScanPoint, request: NormalRequest) -> list[ScanPoint]:
+    """Where the touches about a point come down, on the plane that is expected there."""
+    turn = _frame(point.normal)
+    angles = 2 * math.pi * np.arange(request.touches) / request.touches
+    circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(request.touches)])
+    places = np.array(point.position_m) + request.radius_m * circle @ turn.T
+    return [
+        replace(point, position_m=(x, y, z), label=f"{point.label}, touch {index + 1}")
+        for index, (x, y, z) in enumerate(places.tolist())
+    ]
+
+
+def normal_of_touches(
+    point: ScanPoint, touches: tuple[Touch, ...], ball_radius_m: float, heading_rad: float
+) -> FoundNormal:
+    """Normal of the plane through the ball's centres, and the place that it belongs to.
+
+    Parameters
+    ----------
+    point : ScanPoint
+        As it is expected.
+    touches : tuple of Touch
+        Three or more, along its normal, so that their deviations are those of heights along it.
+    ball_radius_m, heading_rad : float
+
+    Raises
+    ------
+    ValueError
+        If the touches do not determine a plane.
+    """
+    turn, place = _frame(point.normal), np.array(point.position_m)
+    local = (np.array([touch.ball_m for touch in touches]) - place) @ turn  # (n, 3)
+    plane = fit_surface(local, [touch.std_m for touch in touches], "plane")
+    across = plane.normal([0.0, 0.0])
+    height, slopes = (
+        float(plane.height_m([0.0, 0.0])),
+        plane.covariance_m2[1:, 1:] / plane.scale_m**2,
+    )
+    normal = turn @ across
+    # the ball above the point touches beside it on a slope; of that place, not of the point's, is the normal
+    touched = place + height * turn[:, 2] - ball_radius_m * normal
+    worst = float(np.max(np.abs(plane.residuals_m)))
+    made = replace(
+        point,
+        position_m=tuple(touched.tolist()),
+        normal=tuple(normal.tolist()),
+        orientation_xyzw=tuple(tip_orientation(normal, heading_rad).tolist()),
+        height_std_m=float(plane.height_std_m([0.0, 0.0])),
+    )
+    # an angle is no larger than its tangent
+    std = math.sqrt(float(np.linalg.eigvalsh(slopes)[-1]))
+    return FoundNormal(made, std, math.acos(min(1.0, float(across[2]))), worst, touches)
+
+
+def _require_good(found: FoundNormal, request: NormalRequest) -> None:
+    for what, value, name, otherwise in (
+        ("angle from the expected normal [rad]", round(found.angle_rad, 4), "most_angle_rad", ""),
+        (
+            *("a touch off the plane through all [m]", round(found.worst_m, 6)),
+            *("tolerance_m", ": a smaller radius_m, or a smooth place"),
+        ),
+        (
+            *("standard deviation [rad]", round(found.std_rad, 4)),
+            *("most_std_rad", ": a larger radius_m, or more touches"),
+        ),
+    ):
+        most = getattr(request, name)
+        require(value <= most, what, value, f"{name} = {most:g} or less{otherwise}")
+
+
+def _frame(normal: tuple[float, float, float]) -> FloatArray:
+    """(3, 3) axes in columns, the third along a normal."""
+    z = np.asarray(normal, float)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])

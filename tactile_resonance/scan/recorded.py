@@ -11,8 +11,7 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 from tactile_resonance.recording.messages import excitation_from_message, record_from_message
 from tactile_resonance.recording.recording import Recording
-from tactile_resonance.recording.store import StoredEntry, StoredMeasurement, choose
-from tactile_resonance.recording.store_recording import recording_of
+from tactile_resonance.recording.store import StoredEntry, StoredMeasurement, choose, recording_of
 from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import (
     POLES_TYPE,

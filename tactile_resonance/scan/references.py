@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ class SensorHealth(str, Enum):
 
 def relative_to_air(
     estimate: FloatArray, covariance: FloatArray, air: MainMode
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Compare f0 [Hz] and damping ratio (2,) of covariance (2, 2) with those in air.
 
     The two measurements are independent: variances add, those of the ratio to first order.

@@ -27,11 +27,11 @@ from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
 from tactile_resonance.poles.result import STATUSES, Poles, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
-from tactile_resonance.rows_file import RowsWriter
 from tactile_resonance.scan.kept_bins import (
     PLACE,
     BinsKind,
     KeptBins,
+    RowsWriter,
     bins_of_point,
     keep_bins,
     kept_bins,

@@ -28,7 +28,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -391,10 +391,10 @@ def _plan_text(content: RunContent) -> bytes:
     plan: dict[str, Any] = {
         "format": FORMAT,
         "facts": dict(content.facts),
-        "points": [point.as_json() for point in content.points],
+        "points": [asdict(point) for point in content.points],
     }
     if content.places:
-        plan["places"] = [point.as_json() for point in content.places]
+        plan["places"] = [asdict(point) for point in content.places]
     plan[CHECKSUM] = checksum_of(plan)
     return (json.dumps(plan, indent=1, allow_nan=False) + "\n").encode()
 

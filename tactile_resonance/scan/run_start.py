@@ -15,7 +15,7 @@ from typing import Any
 from tactile_resonance.configuration import PACKAGE_NAME, share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
-from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.scan.clearance import Standoffs, TipUse
 from tactile_resonance.scan.goal import (
     Frames,
     GoalFiles,
@@ -32,7 +32,6 @@ from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, ended_by_storage, expected_bytes
 from tactile_resonance.scan.scene import ScanScene, read_run_scene
-from tactile_resonance.scan.standoff import Standoffs
 from tactile_resonance.sensor import sensor_named
 
 _LIBRARIES = ("numpy", "scipy", "rosbags", "ur-rtde", "python-can")

@@ -38,7 +38,6 @@ from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.progress import Controls, Phase, Progress, Request, Summary
-from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.references import (
     AFTER,
     BEFORE,
@@ -48,6 +47,7 @@ from tactile_resonance.scan.references import (
 )
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory, ended_by_storage
 from tactile_resonance.scan.scene import OnFailure, Output
+from tactile_resonance.scan.tissue_tests import ProtocolRequest, fits_of, write_fits
 from tactile_resonance.tissue.nominal_contact import ContactLoad
 
 POLL_S = 0.05
@@ -119,9 +119,6 @@ class ScanRunner:
             self._point(point)
         self._reference(AFTER)
         if self._scene.protocols:
-            # only here: what is compiled for the fits takes a second to load
-            from tactile_resonance.scan.tissue_tests import fits_of, write_fits
-
             write_fits(self._run.path, list(fits_of(self._run.content)))
 
     def _ended_by(self, do: Callable[[], object]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
 from itertools import pairwise
 from pathlib import Path
@@ -30,12 +30,10 @@ from tactile_resonance.fields import (
 )
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, PoleBand
 from tactile_resonance.scan.adaptive import Adaptive, read_adaptive
+from tactile_resonance.scan.clearance import is_plane
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
-from tactile_resonance.scan.notes import Notes
 from tactile_resonance.scan.period import residual_terms_of
 from tactile_resonance.scan.points import flat, read_positions, require_near
-from tactile_resonance.scan.protocols import ProtocolRequest
-from tactile_resonance.scan.standoff import is_plane
 from tactile_resonance.scan.surface import (
     NormalRequest,
     Plane,
@@ -43,6 +41,8 @@ from tactile_resonance.scan.surface import (
     TouchRequest,
     read_surface,
 )
+from tactile_resonance.scan.tissue_tests import ProtocolRequest
+from tactile_resonance.strict_yaml import parse_yaml
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import (
@@ -213,6 +213,38 @@ class Gate:
         check_above_zero(self, "force_rms_n")
         require(self.force_error_n > 0, "force_error_n", self.force_error_n, "a number above 0")
         check_within(self, measurements=(1, 100))
+
+
+@dataclass(frozen=True)
+class Notes:
+    """Notes of a session; what is None or empty was not noted.
+
+    Attributes
+    ----------
+    temperature_c : float or None
+        Of the sample [degrees Celsius].
+    tip_wetness : str
+        dry or wet.
+    adhesion : str
+        Whether the tip sticks to the sample, in words.
+    remarks : str
+    """
+
+    temperature_c: float | None = None
+    tip_wetness: str | None = None
+    adhesion: str | None = None
+    remarks: str | None = None
+
+    def __post_init__(self) -> None:
+        warm = self.temperature_c
+        good = warm is None or -50 <= warm <= 150
+        require(good, "temperature_c", warm, "-50 to 150 degrees Celsius")
+        good = self.tip_wetness in ("dry", "wet", "", None)
+        require(good, "tip_wetness", self.tip_wetness, "one of dry, wet")
+
+    def as_json(self) -> dict[str, float | str]:
+        """What was noted, by name."""
+        return {key: value for key, value in asdict(self).items() if value not in (None, "")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -414,3 +446,19 @@ def _read_precision(
     require(good, f"{where}.separate", wanted.separate, accepted)
     first, second = (by_name[name] for name in wanted.separate)
     return build(Separate, where, first, second, wanted.probability)
+
+
+def parse_notes(text: str, where: str) -> Notes:
+    """Notes of a text like ``{temperature_c: 21.5, tip_wetness: wet}``; of an empty one none.
+
+    Raises
+    ------
+    ValueError
+        If it is no mapping, or a field is unknown or of the wrong kind.
+    """
+    try:
+        given = parse_yaml(text) if text.strip() else {}
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    require(isinstance(given, dict), where, text, "a YAML mapping")
+    return read_dataclass(Notes, given, where)

@@ -1,32 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a table stands in the robot's base, from touches: height and tilts, with their covariance.
+"""Where a table stands in the robot's base, from touches: height and tilts, with their covariance; its file.
 
 A touch comes down along the table's normal as it is known, so its error is one of height, and the plane is the
-weighted least-squares fit of heights over x, y (`scan.touch`). x and y of the origin and the turn about the
+weighted least-squares fit of heights over x, y (`fit_surface`). x and y of the origin and the turn about the
 normal do not show in any height: they stay as they are known, and have no covariance.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.fields import check_above_zero, check_within, number, require
+from tactile_resonance.contact.vectors import Six, Vector
+from tactile_resonance.fields import (
+    check_above_zero,
+    check_within,
+    number,
+    read_dataclass,
+    read_yaml,
+    require,
+)
 from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.scene import SensorUse
 from tactile_resonance.scan.surface import TouchRequest, check_search
-from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M, find_surface, fit_touches
-from tactile_resonance.scan.touch import TouchedSurface, fit_surface
+from tactile_resonance.scan.surface_search import (
+    LEAST_TOUCH_STD_M,
+    TouchedSurface,
+    find_surface,
+    fit_surface,
+    fit_touches,
+)
+from tactile_resonance.strict_yaml import dump_yaml
 
 MOST_TILT_STD_RAD = 5e-3
 """Standard deviation of the tilt about any axis; beyond it the points lie too close together or to one line."""
+FORMAT = "tactile_resonance table 1"
+ORDER = ("height_m", "tilt_x_rad", "tilt_y_rad")
+NOT_ESTIMATED = ("x", "y", "turn about the normal")
+_HEADER = """\
+# A table in the robot's base, found by touch: `ros2 launch ... table_in_base:=THIS_FILE` takes it.
+# Lengths in m, angles in rad. No touch along the normal determines what is not estimated: it is as given.
+"""
 
 
 @dataclass(frozen=True)
@@ -243,3 +266,67 @@ def _contradiction(
         numbers = ", ".join(str(index + 1) for index, _ in alone)
         return f"{text}: one of {numbers} is off, more touches would show which"
     return f"{text}: more touches would show which is off, or the surface is not flat (flatness_m)"
+
+
+def as_text(made: TableCalibration, request: CalibrationRequest, known: Mapping[str, Any]) -> str:
+    """Content of the file.
+
+    Parameters
+    ----------
+    made : TableCalibration
+    request : CalibrationRequest
+    known : mapping
+        What else a reader should know: frames, date, who made it.
+    """
+    touches = [
+        {"ball_m": list(t.ball_m), "std_m": std, "force_n": t.force_n, "residual_m": residual}
+        for t, std, residual in zip(
+            made.touches, made.std_m.tolist(), made.residuals_m.tolist(), strict=True
+        )
+    ]
+    content = {
+        "format": FORMAT,
+        "table_in_base": made.table_in_base.vector.tolist(),
+        **known,
+        "estimated": list(ORDER),
+        "not_estimated": list(NOT_ESTIMATED),
+        "correction": made.correction.tolist(),
+        "covariance": made.covariance.tolist(),
+        "reduced_chi_square": made.reduced_chi_square,
+        "force_n": request.force_n,
+        "flatness_m": request.flatness_m,
+        "height_m": request.height_m,
+        "sensor": request.sensor,
+        "touches": touches,  # in the frame of the table as it was known
+    }
+    return _HEADER + dump_yaml(content)
+
+
+def read_table(path: Path, base_frame: str) -> list[float]:
+    """Position [m] and rotation vector [rad] of a table in a base, from its file.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be read, or is something else, or of another base; names field, value and what is accepted.
+    """
+    content = read_yaml(path)
+    form = content.get("format")
+    require(form == FORMAT, f"{path}: format", form, f"{FORMAT!r}, as calibrate_table writes it")
+    read = {item.name: content.get(item.name) for item in fields(_Table)}  # the rest is for people
+    table = read_dataclass(_Table, read, f"{path}:")
+    accepted = f"{base_frame!r}, the robot's base here"
+    require(table.base_frame == base_frame, f"{path}: base_frame", table.base_frame, accepted)
+    return list(table.table_in_base)
+
+
+@dataclass(frozen=True)
+class _Table:
+    table_in_base: Six
+    covariance: tuple[Vector, Vector, Vector]
+    base_frame: str
+
+    def __post_init__(self) -> None:
+        for index, row in enumerate(self.covariance):
+            name = f"covariance[{index}][{index}]"
+            require(row[index] > 0, name, row[index], "a variance above 0")

@@ -12,7 +12,7 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 from robot_at_hand import own_host
 
 from benchmarks.load_case import Load, demonstrate
-from tactile_resonance.scan.bench_truth import deviations, truths_of
+from tactile_resonance.report.point_details import deviations, truths_of
 from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run

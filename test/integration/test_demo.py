@@ -15,7 +15,7 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 
 from robot_at_hand import own_host
 
-from tactile_resonance.scan.bench_truth import deviations, truths_of
+from tactile_resonance.report.point_details import deviations, truths_of
 from tactile_resonance.scan.run_content import read_run
 
 sys.path.insert(0, str(Path(__file__).parent))

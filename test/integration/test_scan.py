@@ -21,8 +21,8 @@ from tactile_resonance.commands.bench_scan import NODES
 from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.report.point_details import deviations, truths_of
 from tactile_resonance.report.run_report import read_silent
-from tactile_resonance.scan.bench_truth import deviations, truths_of
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.tissue_tests import fits_at, fits_of

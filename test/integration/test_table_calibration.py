@@ -25,7 +25,7 @@ from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.processes import NodeProcesses
-from tactile_resonance.scan.table_file import read_table
+from tactile_resonance.scan.table_calibration import read_table
 
 SCENE = share_path("config/scenes/inclusion_scan.yaml")
 POINTS = [Point(x=float(x), y=float(y)) for x, y in yaml.safe_load(SIMULATED_POINTS)]

@@ -25,7 +25,7 @@ from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording import messages
-from tactile_resonance.recording.store_recording import recording_of
+from tactile_resonance.recording.store import recording_of
 from tactile_resonance.scan.point_result import PointKind, PointResult
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.recorded import EXCITATION, RECORD, read_recorded

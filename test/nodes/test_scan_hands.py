@@ -28,11 +28,11 @@ from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
+from tactile_resonance.scan.clearance import Standoffs
 from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceEarly
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.scene import Hold, ScanScene
-from tactile_resonance.scan.standoff import Standoffs
 from tactile_resonance.scan.surface import Plane
 from test.spinning import spin_until
 

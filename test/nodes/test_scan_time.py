@@ -17,7 +17,7 @@ from tactile_resonance.nodes.bench_player import BenchServer
 from tactile_resonance.nodes.node_watch import SILENT_S
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import TipContact
-from tactile_resonance.scan.point_times import StateTimes
+from tactile_resonance.scan.point_outcome import StateTimes
 
 SERVER = own_time(41)
 BLOCK_NS = 400_000_000

@@ -15,7 +15,7 @@ from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.tip_contact import TipContact, _failure
 from tactile_resonance.scan.hands import PointDisturbed, ScanEnded
-from tactile_resonance.scan.point_times import StateTimes
+from tactile_resonance.scan.point_outcome import StateTimes
 from tactile_resonance.scan.scene import Hold
 
 NOT_OF_THE_POINT = (

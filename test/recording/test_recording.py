@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from tactile_resonance.recording.files import read_recording
-from tactile_resonance.recording.recording import make_recording
+from tactile_resonance.recording.recording import make_recording, read_recording
 
 RNG = np.random.default_rng(0)
 U, Y = RNG.standard_normal((2, 24))

@@ -16,9 +16,9 @@ from tactile_resonance.report.point_details import FRF_TYPE, STATE_TYPE
 from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
-from tactile_resonance.scan.protocols import TYPE as INDENTATION_TYPE
 from tactile_resonance.scan.recorded import EXCITATION
 from tactile_resonance.scan.scene import read_scan_scene
+from tactile_resonance.scan.tissue_tests import TYPE as INDENTATION_TYPE
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene

@@ -17,7 +17,7 @@ import pytest
 from tactile_resonance import cli
 from tactile_resonance.report.live_run import MOST_OF_A_MAP, LiveRun
 from tactile_resonance.report.live_server import LOOPBACK, MOST_READERS, LiveServer
-from tactile_resonance.report.page_data import point_entry
+from tactile_resonance.report.page import point_entry
 from tactile_resonance.report.point_details import FRF_TYPE, MOST_DETAILED
 from tactile_resonance.scan.messages import make_message
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult

@@ -19,7 +19,7 @@ from tactile_resonance.cli import main
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.report import point_details
-from tactile_resonance.report.page_data import as_json, model_response, s_plane
+from tactile_resonance.report.page import as_json, model_response, s_plane
 from tactile_resonance.report.point_details import MOST_DETAILED, detailed, lines_each
 from tactile_resonance.report.run_report import as_page, warnings_of
 from tactile_resonance.scan import tissue_tests

@@ -15,11 +15,11 @@ from tactile_resonance.scan.hands import Measured, PointFailed
 from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.progress import Controls
-from tactile_resonance.scan.protocols import TOPIC, TYPE
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import ScanScene
+from tactile_resonance.scan.tissue_tests import TOPIC, TYPE
 
 SPREAD_HZ = 0.02
 TOUCH_S, BLOCK_S = 0.01, 0.01

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.report.point_table import point_table, repeats_sentence, table_notes
-from tactile_resonance.scan.bench_truth import deviations, truths_of
+from tactile_resonance.report.point_details import deviations, truths_of
+from tactile_resonance.report.run_tables import point_table, repeats_sentence, table_notes
 from tactile_resonance.scan.messages import header_message, make_message, message_types, to_cdr
 from tactile_resonance.scan.point_result import TYPE as RESULT
 from tactile_resonance.scan.point_result import PointOutcome

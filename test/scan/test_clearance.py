@@ -14,7 +14,7 @@ from tactile_resonance.scan.clearance import TipUse, clear_points, lowest_at_dep
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import ScanScene, SensorUse
 from tactile_resonance.scan.surface import HeightField, Plane
-from tactile_resonance.scan.touch import fit_surface
+from tactile_resonance.scan.surface_search import fit_surface
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
 from contacts import QUICK

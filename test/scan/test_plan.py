@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Patterns, poses, time and what is left out."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -18,9 +18,15 @@ from tactile_resonance.scan.plan import (
     NEAR_CONTACT_S,
     TRAVEL_M_S,
     make_plan,
+)
+from tactile_resonance.scan.points import (
+    ScanPoint,
+    grid,
+    inside_polygon,
+    read_positions,
+    spiral,
     tip_orientation,
 )
-from tactile_resonance.scan.points import ScanPoint, grid, inside_polygon, read_positions, spiral
 from tactile_resonance.scan.scene import Output, ScanScene
 from tactile_resonance.scan.surface import HeightField, Plane, TouchRequest
 
@@ -120,7 +126,7 @@ def test_points_lie_on_the_surface_in_order():
         [[0.01, 0, 0.102], [0.02, 0, 0.104], [0, 0.03, 0.1]],
     )
     for p in plan.points:
-        assert read_dataclass(ScanPoint, p.as_json(), "points") == p
+        assert read_dataclass(ScanPoint, asdict(p), "points") == p
     # a height that is given wins
     given = make_plan(scene([[0.01, 0, 0.5]], surface=surface))
     assert given.points[0].position_m == (0.01, 0.0, 0.5)

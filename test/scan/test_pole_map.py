@@ -19,9 +19,9 @@ from tactile_resonance.scan.decision import Decision, Verdict
 from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.map_messages import POINT, cloud_message
 from tactile_resonance.scan.messages import header_message
-from tactile_resonance.scan.plan import tip_orientation
 from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result, with_poles
 from tactile_resonance.scan.point_result import PointOutcome, PointResult, as_csv
+from tactile_resonance.scan.points import tip_orientation
 from tactile_resonance.scan.pole_map import (
     SAME_PLACE_M,
     EllipseScale,

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from tactile_resonance.poles.result import Poles
-from tactile_resonance.scan.notes import Notes, parse_notes
 from tactile_resonance.scan.references import SensorHealth, judge_drift, relative_to_air
-from tactile_resonance.scan.scene import DriftLimits
+from tactile_resonance.scan.scene import DriftLimits, Notes, parse_notes
 
 LIMITS = DriftLimits(f0_hz=0.05, damping_ratio=5e-5)
 

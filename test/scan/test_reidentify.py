@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from tactile_resonance.cli import main
-from tactile_resonance.rows_file import Rows, RowsWriter
 from tactile_resonance.scan import reidentify as module
+from tactile_resonance.scan.kept_bins import Rows, RowsWriter
 from tactile_resonance.scan.messages import to_cdr
 from tactile_resonance.scan.run_directory import RunDirectory
 

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from tactile_resonance.poles.result import Poles
-from tactile_resonance.report.point_table import point_table
 from tactile_resonance.report.run_report import pole_maps_of
 from tactile_resonance.report.run_report import summary as sentences
+from tactile_resonance.report.run_tables import point_table
 from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import read_messages

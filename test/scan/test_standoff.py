@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from tactile_resonance.scan.clearance import LEAST_M, NEAR_M, Standoffs
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.standoff import LEAST_M, NEAR_M, Standoffs
 from tactile_resonance.scan.surface import HeightField, Plane, TouchRequest
 
 UP, TURN, STD_M = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), 2e-5

@@ -9,9 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_resonance.scan.mesh import TriangleMesh, read_stl
-from tactile_resonance.scan.surface import HeightField, Plane, TouchRequest, read_surface
-from tactile_resonance.scan.touch import fit_surface
+from tactile_resonance.scan.surface import (
+    HeightField,
+    Plane,
+    TouchRequest,
+    TriangleMesh,
+    read_stl,
+    read_surface,
+)
+from tactile_resonance.scan.surface_search import fit_surface
 
 slopes = st.floats(-1.5, 1.5)
 

@@ -19,11 +19,14 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
 from tactile_resonance.scan.table_calibration import (
+    NOT_ESTIMATED,
+    ORDER,
     CalibrationRequest,
+    as_text,
     calibrate_table,
+    read_table,
     table_from_touches,
 )
-from tactile_resonance.scan.table_file import NOT_ESTIMATED, ORDER, as_text, read_table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
 from contacts import RADIUS_M, contact

@@ -20,11 +20,10 @@ from tactile_resonance.scan.hands import PointDisturbed, PointFailed
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.plan_text import plan_rows
 from tactile_resonance.scan.point_result import PointOutcome
-from tactile_resonance.scan.protocols import ProtocolRequest
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_start import new_run, start_run
 from tactile_resonance.scan.scene import read_scan_scene
-from tactile_resonance.scan.tissue_tests import fits_at, fits_of
+from tactile_resonance.scan.tissue_tests import ProtocolRequest, fits_at, fits_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from bench_hands import Bench, scan, scene

@@ -12,13 +12,13 @@ import pytest
 
 from tactile_resonance.contact.goal import State
 from tactile_resonance.report.run_report import as_page, summary
-from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.point_times import (
+from tactile_resonance.scan.point_outcome import (
     BETWEEN,
     StateTimes,
     budget_sentence,
     time_budget,
 )
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from bench_hands import Bench, scan, scene
