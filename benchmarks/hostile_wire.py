@@ -19,7 +19,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.drivers.can_bus import SocketcandBus
 from tactile_resonance.drivers.can_frames import Assembler, read_can_description
 from tactile_resonance.drivers.rtde_stream import PORT, RtdeStream
-from tactile_resonance.report.live_server import LiveServer
+from tactile_resonance.report.live import LiveServer
 from tactile_resonance.simulation.cell.tcp_bus import SlcanServer, SocketcandServer
 from tactile_resonance.simulation.plant.simulated_robot import (
     ControlService,

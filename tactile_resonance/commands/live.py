@@ -34,8 +34,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Listen and serve until interrupted."""
     from tactile_resonance.commands.options import require_packages
-    from tactile_resonance.report.live_run import LiveRun
-    from tactile_resonance.report.live_server import LiveServer
+    from tactile_resonance.report.live import LiveRun, LiveServer
 
     require_packages("rclpy", "tactile_resonance.msg")
     from rclpy.exceptions import InvalidNamespaceException

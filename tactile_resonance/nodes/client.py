@@ -28,7 +28,7 @@ from tactile_resonance.scan.point_result import from_message
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from tactile_resonance.report.live_run import LiveRun
+    from tactile_resonance.report.live import LiveRun
 
 HANGS_S = 120.0
 """Longest wait for what takes seconds [s]: it only ends what hangs, whatever else the machine does."""

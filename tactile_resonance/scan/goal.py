@@ -83,22 +83,6 @@ class Frames:
         return known[name]
 
 
-@dataclass(frozen=True)
-class WantedScan:
-    """What a goal asks for.
-
-    Attributes
-    ----------
-    plan : Plan
-        Of the scene, with what the goal has in place of the file's.
-    text : str
-        That scene as a scene file.
-    """
-
-    plan: Plan
-    text: str
-
-
 def named_frames(goal: ScanGoal, frames: Frames) -> tuple[str, ...]:
     """Frames beside table and base in which a goal has its poses or its scene.
 
@@ -112,8 +96,10 @@ def named_frames(goal: ScanGoal, frames: Frames) -> tuple[str, ...]:
     return tuple({name for name in named if name and name not in (frames.table, frames.base)})
 
 
-def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
-    """What a goal for a new run asks for.
+def read_goal(goal: ScanGoal, frames: Frames) -> tuple[Plan, str]:
+    """Plan of the scene that a goal for a new run asks for, and that scene as a scene file.
+
+    Both with what the goal has in place of the file's.
 
     Raises
     ------
@@ -138,10 +124,10 @@ def read_goal(goal: ScanGoal, frames: Frames) -> WantedScan:
     if goal.scene and not (changes or named):
         text = path.read_text(encoding="utf-8")
     if not len(poses):
-        return WantedScan(make_plan(scene), text)
+        return make_plan(scene), text
     normals = Rotation.from_quat(poses[:, 3:]).apply([0.0, 0.0, 1.0])  # (n, 3)
     points = scan_points(scene.name, poses[:, :3], normals, poses[:, 3:])
-    return WantedScan(plan_points(scene, points), text)
+    return plan_points(scene, points), text
 
 
 def resumed_run(goal: ScanGoal) -> Path:

@@ -13,7 +13,7 @@ from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Separate
 from tactile_resonance.scan.period import lines_of, shortest_samples
-from tactile_resonance.scan.scene import Output, ScanScene
+from tactile_resonance.scan.scene import Output, ScanScene, SensorUse
 
 # Beside the band of the fit: the local polynomial method looks at neighbours, the fit does not.
 MARGIN_LINES = 8
@@ -132,9 +132,8 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     distortion = Output.DISTORTION in outputs
     share = ODD_RANDOM_SHARE if distortion else 1.0
     samples, margin = use.samples_per_period, MARGIN_LINES
-    least_s = (
-        0.0 if scene.gate is None else SHORTEST_S
-    )  # a gate judges how the force of a block moved
+    # a gate judges how the force of a block moved
+    least_s = 0.0 if scene.gate is None else SHORTEST_S
     if samples is None:
         samples, margin = shortest_samples(use.bands, use.sample_rate_hz, share, least_s), 0
     spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
@@ -155,29 +154,19 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
                 f"sensor.band: got {found} excited lines from {band.low_hz:g} to {band.high_hz:g} Hz, "
                 f"{spacing_hz:g} Hz apart; accepted is more than {fewest}"
             )
-    skipped = []
-    of_whole = lines_of(whole_hz[0], spacing_hz)
-    if narrow:
-        text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
-        named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
-        skipped.append(Skipped(text, f"only poles from {named} are wanted"))
+    skipped = [_only_poles(use, lines, spacing_hz, top_hz)] if narrow else []
     if not distortion:
         skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
     if Output.SILENT not in outputs:
-        skipped.append(
-            Skipped(
-                "a silent record",
-                "silent is not wanted",
-                _of_reference(blocks, block_s) * block_s,
-            )
-        )
+        silent_s = _of_reference(blocks, block_s) * block_s
+        skipped.append(Skipped("a silent record", "silent is not wanted", silent_s))
     if Output.MAP not in outputs:
         skipped.append(Skipped("pole_map.png and map.mcap", "no map is wanted"))
     return MeasurementDesign(
         bands=use.bands,
         stretches_hz=stretches_hz,
         grid=Grid.ODD_RANDOM if distortion else Grid.FULL,
-        level_v=use.level_v * math.sqrt(lines / lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz)),
+        level_v=_level_v(use, lines, spacing_hz),
         sample_rate_hz=use.sample_rate_hz,
         samples=samples,
         blocks=blocks,
@@ -215,14 +204,11 @@ def _design_calibrated(scene: ScanScene, top_hz: float) -> MeasurementDesign:
     require(lines >= FEWEST_CALIBRATED, "sensor.band", list(ends_hz), accepted)
     least = 1 if isinstance(scene.precision, Separate) else BlockLimits().least
     blocks = scene.blocks or BlockLimits(least, max(least, math.ceil(CALIBRATED_MOST_S / block_s)))
-    of_whole = lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz)
-    text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
-    named = f"only poles from {ends_hz[0]:g} to {ends_hz[1]:g} Hz are wanted"
     return replace(
         air,
-        skipped=(Skipped(text, named), *air.skipped[1:]),
+        skipped=(_only_poles(use, lines, spacing_hz, top_hz), *air.skipped[1:]),
         stretches_hz=(ends_hz,),
-        level_v=use.level_v * math.sqrt(lines / of_whole),
+        level_v=_level_v(use, lines, spacing_hz),
         samples=samples,
         blocks=blocks,
         periods=blocks.most,
@@ -230,6 +216,18 @@ def _design_calibrated(scene: ScanScene, top_hz: float) -> MeasurementDesign:
         sweep=True,
         air=air,
     )
+
+
+def _only_poles(use: SensorUse, lines: int, spacing_hz: float, top_hz: float) -> Skipped:
+    of_whole = lines_of((F_MIN_HZ, top_hz), spacing_hz)
+    named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
+    text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
+    return Skipped(text, f"only poles from {named} are wanted")
+
+
+def _level_v(use: SensorUse, lines: int, spacing_hz: float) -> float:
+    """Of so many lines, each at the amplitude that it has where the sensor's whole range is excited [V rms]."""
+    return use.level_v * math.sqrt(lines / lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz))
 
 
 def excitation_of(design: MeasurementDesign, seed: int) -> Excitation:

@@ -16,14 +16,7 @@ from tactile_resonance.configuration import PACKAGE_NAME, share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.scan.clearance import Standoffs, TipUse
-from tactile_resonance.scan.goal import (
-    Frames,
-    GoalFiles,
-    ScanGoal,
-    WantedScan,
-    read_goal,
-    resumed_run,
-)
+from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal, read_goal, resumed_run
 from tactile_resonance.scan.hands import Check, Hands, Touch
 from tactile_resonance.scan.plan import Plan, plan_points
 from tactile_resonance.scan.points import ScanPoint
@@ -38,15 +31,6 @@ _LIBRARIES = ("numpy", "scipy", "rosbags", "ur-rtde", "python-can")
 
 
 @dataclass(frozen=True)
-class NewRun:
-    """A run that a goal asks for: what is wanted, its folder, and the room that needs [bytes]."""
-
-    wanted: WantedScan
-    path: Path
-    needed_bytes: int
-
-
-@dataclass(frozen=True)
 class StartedRun:
     """A run that is open, with all that a `ScanRunner` needs of it."""
 
@@ -55,8 +39,10 @@ class StartedRun:
     seed: int
 
 
-def new_run(goal: ScanGoal, frames: Frames, files: GoalFiles, *, forces: bool) -> NewRun:
-    """What a goal asks for, with nothing moved or written yet.
+def new_run(
+    goal: ScanGoal, frames: Frames, files: GoalFiles, *, forces: bool
+) -> tuple[Plan, str, Path, int]:
+    """What a goal asks for, with nothing moved or written yet: `read_goal`, the run's folder and its bytes.
 
     Parameters
     ----------
@@ -72,12 +58,12 @@ def new_run(goal: ScanGoal, frames: Frames, files: GoalFiles, *, forces: bool) -
     ValueError, OSError
         If it is wrong, or the run cannot begin in its folder.
     """
-    wanted = read_goal(goal, frames)
-    _require_force(wanted.plan.scene, forces)
+    plan, text = read_goal(goal, frames)
+    _require_force(plan.scene, forces)
     path = Path(goal.run_directory) if goal.run_directory else files.unused()
-    needed = expected_bytes(wanted.plan.most_points, wanted.plan.measurement)
+    needed = expected_bytes(plan.most_points, plan.measurement)
     RunDirectory.check_new(path, needed)
-    return NewRun(wanted, path, needed)
+    return plan, text, path, needed
 
 
 def start_run(
@@ -113,8 +99,8 @@ def start_run(
     """
     if goal.resume:
         return _resumed(resumed_run(goal), frames, hands)
-    new = new_run(goal, frames, files, forces=hands.free_air)
-    scene = _placed(new.wanted.plan.scene, frames, hands)
+    wanted, text, path, needed = new_run(goal, frames, files, forces=hands.free_air)
+    scene = _placed(wanted.scene, frames, hands)
     _require_tests(scene, hands)
     radius_m = sensor_named(scene.sensor.name).tip.radius_m
 
@@ -123,7 +109,7 @@ def start_run(
         return hands.find(point, force_n, radius_m, check)
 
     use = None if tip_use is None else lambda: tip_use(scene.sensor.name)
-    plan, found = prepare(new.wanted.plan, radius_m, find, use)
+    plan, found = prepare(wanted, radius_m, find, use)
     seed = goal.seed or seed
     facts = run_facts(
         plan,
@@ -141,9 +127,7 @@ def start_run(
         },
     )
     places = plan.points if scene.adaptive else ()
-    run = RunDirectory.create(
-        new.path, new.wanted.text, plan.first_points, facts, new.needed_bytes, places
-    )
+    run = RunDirectory.create(path, text, plan.first_points, facts, needed, places)
     return StartedRun(plan, run, seed)
 
 

@@ -14,13 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from tactile_resonance.poles.result import MainMode, Poles
-from tactile_resonance.scan.decision import (
-    Decision,
-    Separate,
-    Verdict,
-    decide_bands,
-    decide_tissue,
-)
+from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide_bands, decide_tissue
 from tactile_resonance.scan.gate import GateKeeper
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
@@ -38,13 +32,7 @@ from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.progress import Controls, Phase, Progress, Request, Summary
-from tactile_resonance.scan.references import (
-    AFTER,
-    BEFORE,
-    SILENT,
-    read_reference,
-    sensor_health,
-)
+from tactile_resonance.scan.references import AFTER, BEFORE, SILENT, read_reference, sensor_health
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory, ended_by_storage
 from tactile_resonance.scan.scene import OnFailure, Output
 from tactile_resonance.scan.tissue_tests import ProtocolRequest, fits_of, write_fits
@@ -244,14 +232,11 @@ class ScanRunner:
             if measured is not None:
                 measured = measured.with_zero_moved(moved_n)
                 result = measured_result(result, scene, measured, decisions[-1], self._air)
-            if moved_n:
-                text = f"the zero of the force moved by {1e3 * moved_n:.1f} mN in the contact"
-                result = replace(result, reason=_joined(result.reason, text))
-            if not_tested:
-                result = replace(result, reason=_joined(result.reason, not_tested))
+            moved = f"the zero of the force moved by {1e3 * moved_n:.1f} mN in the contact"
             disturbed = self._disturbed.pop(point.index, Disturbances())
             result = replace(
                 result,
+                reason=_joined(result.reason, moved if moved_n else "", not_tested),
                 repeats=disturbed.total,
                 disturbances=str(disturbed),
                 gate="" if measured is None else str(keeper),
@@ -432,6 +417,6 @@ class ScanRunner:
         )
 
 
-def _joined(text: str, more: str) -> str:
-    """Two reasons as one; the same one once."""
-    return "; ".join(dict.fromkeys(filter(None, (text, more))))
+def _joined(*texts: str) -> str:
+    """Reasons as one; the same one once."""
+    return "; ".join(dict.fromkeys(filter(None, texts)))

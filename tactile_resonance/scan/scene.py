@@ -34,22 +34,12 @@ from tactile_resonance.scan.clearance import is_plane
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
 from tactile_resonance.scan.period import residual_terms_of
 from tactile_resonance.scan.points import flat, read_positions, require_near
-from tactile_resonance.scan.surface import (
-    NormalRequest,
-    Plane,
-    Surface,
-    TouchRequest,
-    read_surface,
-)
+from tactile_resonance.scan.surface import NormalRequest, Plane, Surface, TouchRequest, read_surface
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
 from tactile_resonance.strict_yaml import parse_yaml
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import NominalContact
-from tactile_resonance.tissue.references import (
-    parse_classes,
-    parse_nominal_contact,
-    with_library,
-)
+from tactile_resonance.tissue.references import parse_classes, parse_nominal_contact, with_library
 
 # Of the simulated bench: what lies on its table, and how it moves.
 BENCH_KEYS = {"regions", "buried", "motion"}

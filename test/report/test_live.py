@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance import cli
-from tactile_resonance.report.live_run import MOST_OF_A_MAP, LiveRun
-from tactile_resonance.report.live_server import LOOPBACK, MOST_READERS, LiveServer
+from tactile_resonance.report.live import LOOPBACK, MOST_OF_A_MAP, MOST_READERS, LiveRun, LiveServer
 from tactile_resonance.report.page import point_entry
 from tactile_resonance.report.point_details import FRF_TYPE, MOST_DETAILED
 from tactile_resonance.scan.messages import make_message

@@ -42,18 +42,18 @@ def scene(tmp_path):
     return str(path)
 
 
-def again(wanted, tmp_path):
+def again(text, tmp_path):
     """The scene as a run that is gone on with reads it."""
     path = tmp_path / "again.yaml"
-    path.write_text(wanted.text)
+    path.write_text(text)
     return read_scan_scene(path)
 
 
 def test_poses_need_no_scene_and_give_points_at_exactly_these_places(tmp_path):
-    wanted = read_goal(GOAL, FRAMES)
-    assert tuple((*p.position_m, *p.orientation_xyzw) for p in wanted.plan.points) == POSES
-    assert wanted.plan.points[1].normal == pytest.approx(TILTED.apply([0, 0, 1]).tolist())
-    for scene in (wanted.plan.scene, again(wanted, tmp_path)):
+    plan, text = read_goal(GOAL, FRAMES)
+    assert tuple((*p.position_m, *p.orientation_xyzw) for p in plan.points) == POSES
+    assert plan.points[1].normal == pytest.approx(TILTED.apply([0, 0, 1]).tolist())
+    for scene in (plan.scene, again(text, tmp_path)):
         assert (scene.force_n, scene.frame_id) == (0.012, "table")
 
 
@@ -61,16 +61,16 @@ def test_poses_in_the_base_are_those_places_in_the_frame_of_the_scene(scene):
     for named in ("", scene):
         poses = in_base(TABLE_IN_BASE, POSES)
         goal = ScanGoal(scene=named, poses=poses, frame_id="base", force_n=0.012)
-        for point, pose in zip(read_goal(goal, FRAMES).plan.points, POSES, strict=True):
+        for point, pose in zip(read_goal(goal, FRAMES)[0].points, POSES, strict=True):
             assert point.position_m == pytest.approx(pose[:3], abs=1e-12)
             turned = Rotation.from_quat(point.orientation_xyzw) * Rotation.from_quat(pose[3:]).inv()
             assert turned.magnitude() < 1e-12
 
 
 def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene, tmp_path):
-    wanted = read_goal(ScanGoal(scene=scene), FRAMES)
-    assert wanted.text == SCENE
-    assert [p.position_m[2] for p in wanted.plan.points] == [0.0, 0.0]
+    plan, text = read_goal(ScanGoal(scene=scene), FRAMES)
+    assert text == SCENE
+    assert [p.position_m[2] for p in plan.points] == [0.0, 0.0]
     goal = ScanGoal(
         scene=scene,
         poses=POSES,
@@ -79,15 +79,15 @@ def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene
         damping_ratio_std=1e-4,
         notes="{tip_wetness: wet}",
     )
-    wanted = read_goal(goal, FRAMES)
-    for read in (wanted.plan.scene, again(wanted, tmp_path)):
+    plan, text = read_goal(goal, FRAMES)
+    for read in (plan.scene, again(text, tmp_path)):
         assert read.force_n == 0.02
         assert read.precision == Precise(None, 1e-4)
         assert read.notes.tip_wetness == "wet"
         assert read.positions_m.tolist() == [list(pose[:3]) for pose in POSES]
-    assert "gelatine_percent" in wanted.text  # the bench reads it too
-    unset = read_goal(ScanGoal(scene=scene, force_n=math.nan, f0_std_hz=math.nan), FRAMES)
-    assert (unset.plan.scene.force_n, unset.plan.scene.precision) == (0.01, Precise(0.05))
+    assert "gelatine_percent" in text  # the bench reads it too
+    unset, _ = read_goal(ScanGoal(scene=scene, force_n=math.nan, f0_std_hz=math.nan), FRAMES)
+    assert (unset.scene.force_n, unset.scene.precision) == (0.01, Precise(0.05))
 
 
 def test_a_run_holds_the_classes_of_the_library_that_its_scene_names(scene, tmp_path):
@@ -98,8 +98,8 @@ def test_a_run_holds_the_classes_of_the_library_that_its_scene_names(scene, tmp_
         "tissue_classes:\n  gel: {f0_hz: 254, damping_ratio: 0.03, f0_std_hz: 1, damping_ratio_std: 1e-3}\n"
         "spread: {}\n"
     )
-    wanted = read_goal(ScanGoal(scene=str(path)), FRAMES)
-    for read in (wanted.plan.scene, again(wanted, tmp_path)):
+    plan, text = read_goal(ScanGoal(scene=str(path)), FRAMES)
+    for read in (plan.scene, again(text, tmp_path)):
         assert [each.name for each in read.tissue_classes] == ["gel"]
 
 
@@ -156,9 +156,9 @@ def test_poses_in_a_third_frame_are_the_same_points_wherever_the_frame_stands(sc
         seen.append((*back.apply(np.array(pose[:3]) - camera.position_m), *turn))
     for named, stands in (("", TABLE_IN_BASE), (scene, phantom)):
         goal = ScanGoal(scene=named, poses=seen, frame_id="camera", force_n=0.012)
-        wanted = read_goal(goal, frames)
-        assert wanted.plan.scene.frame_id == ("phantom" if named else "table")
-        points = [(*p.position_m, *p.orientation_xyzw) for p in wanted.plan.points]
+        plan, _ = read_goal(goal, frames)
+        assert plan.scene.frame_id == ("phantom" if named else "table")
+        points = [(*p.position_m, *p.orientation_xyzw) for p in plan.points]
         for found, pose in zip(in_base(stands, points), places, strict=True):
             assert found[:3] == pytest.approx(pose[:3], abs=1e-12)
             turned = Rotation.from_quat(found[3:]) * Rotation.from_quat(pose[3:]).inv()
@@ -183,7 +183,7 @@ def test_the_frame_of_a_scene_must_be_known(scene, tmp_path):
         read_goal(ScanGoal(scene=scene), alone)
     # `table` in a scene is the table, whatever it is called here; in a goal frames are those of tf2
     (tmp_path / "slope.yaml").write_text(SCENE.replace("phantom", "table"))
-    assert read_goal(ScanGoal(scene=scene), alone).plan.scene.frame_id == "left/table"
+    assert read_goal(ScanGoal(scene=scene), alone)[0].scene.frame_id == "left/table"
     with pytest.raises(ValueError, match="poses.header.frame_id: got 'table'; accepted is 'left"):
         read_goal(GOAL, alone)
 
