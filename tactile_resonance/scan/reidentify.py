@@ -16,6 +16,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -56,6 +57,7 @@ _MODE = (
     "pole_real_rad_s",
     "pole_imag_rad_s",
 )
+_COSTS = ("cost", "expected_cost")
 _STATUSES = [status.value for status in STATUSES]
 
 Task = TypeVar("Task")
@@ -86,7 +88,7 @@ def row_type(places: int) -> np.dtype:
     ]
     return np.dtype(
         [("run", "<i4"), ("index", "<i4"), ("attempt", "<i4"), ("measurement_id", "<i8")]
-        + [(name, "<f8") for name in (*PLACE[3:], *modes, "cost", "expected_cost")]
+        + [(name, "<f8") for name in (*PLACE[3:], *modes, *_COSTS)]
         + [(STATUS, "<u1")]
     )
 
@@ -248,36 +250,21 @@ def _unsure(batch: PolesBatch, kind: BinsKind) -> BoolArray:
 
 
 def _fill(rows: npt.NDArray, batch: PolesBatch) -> None:
-    """Results of a batch (n,); modes as `Poles.main` and `Poles.best_covariance` choose them."""
-    with np.errstate(all="ignore"):
-        peak = np.abs(batch.residues) / np.abs(batch.poles_rad_s.real)
-    there = np.isfinite(batch.poles_rad_s) & batch.significant
-    order = _main_first(np.where(there, peak, -np.inf))
-
-    def taken(values: npt.NDArray, there: npt.NDArray) -> npt.NDArray:
-        wide = (..., *[None] * (values.ndim - 2))
-        return np.take_along_axis(np.where(there[wide], values, np.nan), order[wide], axis=1)
-
     total = batch.total_covariance
     known = np.isfinite(total).all(axis=(2, 3), keepdims=True)
-    covariance = taken(np.where(known, total, batch.covariance), there)
-    values = (batch.f0_hz, batch.damping_ratio, batch.poles_rad_s)
-    f0_hz, damping_ratio, poles_rad_s = (taken(x, there) for x in values)
-    _fill_modes(rows, f0_hz, damping_ratio, poles_rad_s, covariance)
-    for name in ("cost", "expected_cost"):
-        rows[name] = getattr(batch, name)
+    there = np.isfinite(batch.poles_rad_s) & batch.significant
+    _fill_modes(rows, batch, there, np.where(known, total, batch.covariance))
     rows[STATUS] = batch.status_code
 
 
 def _fill_one(row: npt.NDArray, poles: Poles) -> None:
-    peak = np.abs(poles.residues) / np.abs(poles.poles_rad_s.real)
-    order = _main_first(peak[None])[0]
     _fill_nan(row, PLACE)
-    values = (poles.f0_hz, poles.damping_ratio, poles.poles_rad_s, poles.best_covariance)
-    f0_hz, damping_ratio, poles_rad_s, covariance = (x[None, order] for x in values)
-    _fill_modes(row, f0_hz, damping_ratio, poles_rad_s, covariance)
-    for name in ("cost", "expected_cost"):
-        row[name] = getattr(poles, name)
+    alone = {
+        name: np.asarray(getattr(poles, name))[None]
+        for name in (*("poles_rad_s", "residues", "f0_hz", "damping_ratio"), *_COSTS)
+    }
+    there = np.ones((1, poles.f0_hz.size), bool)
+    _fill_modes(row, SimpleNamespace(**alone), there, poles.best_covariance[None])
     row[STATUS] = STATUSES.index(poles.status)
 
 
@@ -298,21 +285,31 @@ def _main_first(peak: FloatArray) -> IntArray:
 
 def _fill_modes(
     rows: npt.NDArray,
-    f0_hz: npt.NDArray,
-    damping_ratio: npt.NDArray,
-    poles_rad_s: npt.NDArray,
+    found: PolesBatch | SimpleNamespace,
+    there: BoolArray,
     covariance: npt.NDArray,
 ) -> None:
-    """From arrays (n, places)."""
+    """Of a batch (n,): modes that are there (n, places), the one that `Poles.main` means first, with theirs."""
+    with np.errstate(all="ignore"):
+        peak = np.abs(found.residues) / np.abs(found.poles_rad_s.real)
+    order = _main_first(np.where(there, peak, -np.inf))
+
+    def taken(values: npt.NDArray) -> npt.NDArray:
+        wide = (..., *[None] * (values.ndim - 2))
+        return np.take_along_axis(np.where(there[wide], values, np.nan), order[wide], axis=1)
+
+    covariance, poles_rad_s = taken(covariance), taken(found.poles_rad_s)
     with np.errstate(invalid="ignore"):
         std = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
     columns = (
-        *(f0_hz, std[..., 0], damping_ratio, std[..., 1], covariance[..., 0, 1]),
-        *(poles_rad_s.real, poles_rad_s.imag),
+        *(taken(found.f0_hz), std[..., 0], taken(found.damping_ratio), std[..., 1]),
+        *(covariance[..., 0, 1], poles_rad_s.real, poles_rad_s.imag),
     )
     for name, values in zip(_MODE, columns, strict=True):
         for place in range(values.shape[1]):
             rows[name if place == 0 else f"{name}_{place + 1}"] = values[:, place]
+    for name in _COSTS:
+        rows[name] = getattr(found, name)
 
 
 def _as_csv(rows: npt.NDArray, run: str) -> str:
