@@ -16,7 +16,7 @@ PART = ".part"
 
 
 def write_whole(path: Path, content: bytes, written: Callable[[], None] | None = None) -> None:
-    """Write a file that is there whole or not at all, also after a power cut.
+    """Write a file that is there whole or not at all; its name is durable after a `sync` of the folder.
 
     Parameters
     ----------
@@ -46,7 +46,6 @@ def write_whole(path: Path, content: bytes, written: Callable[[], None] | None =
                 written()
             os.fsync(file.fileno())
         part.replace(path)
-        sync(path.parent)
     finally:
         if not told:
             part.unlink(missing_ok=True)

@@ -16,7 +16,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.files import write_whole
+from tactile_resonance.files import sync, write_whole
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 
@@ -58,6 +58,7 @@ def write_stored(
     buffer = io.BytesIO()
     np.savez(buffer, **content)  # type: ignore[arg-type]
     write_whole(path, buffer.getvalue(), written)
+    sync(path.parent)
 
 
 def read_stored(path: Path, kind: type[T]) -> T:

@@ -339,6 +339,7 @@ def write_bag_metadata(folder: Path, files: Sequence[FileContent]) -> None:
         told = f"[{_NEXT.join(map(json.dumps, value))}]" if listed else json.dumps(value)
         text += f"  {key}: {told}\n"
     write_whole(folder / "metadata.yaml", text.encode())
+    sync(folder)
 
 
 def _merged_topics(files: Sequence[FileContent]) -> list[TopicContent]:

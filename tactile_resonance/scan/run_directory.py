@@ -158,6 +158,7 @@ class RunDirectory:
             write_whole(path / SCENE, scene.encode())
             write_entries(path, [entry_of(path / SCENE, SCENE)])
             write_whole(path / "run.json", text)  # last: with it the run exists
+            sync(path)
             sync(path.parent)
             return cls(path, lock, read_run(path))
         except BaseException:
@@ -261,6 +262,7 @@ class RunDirectory:
         """Add the next point of a scan that chooses them, durably; returns it."""
         content = replace(self._opened, points=(*self._points, point))
         write_whole(self.path / "run.json", _plan_text(content))
+        sync(self.path)
         self._points.append(point)
         return point
 
