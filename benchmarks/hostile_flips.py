@@ -99,7 +99,7 @@ def places_in(folder: Path) -> list[Place]:
 def _run(run: Path) -> tuple[str, object]:
     """Scene, plan, facts, results, topics and every sample; problems and unchecked files."""
     content = read_run(run)
-    measured = [of for path in content.paths_in_order for of in measurements_of_file(path)]
+    measured = [of for path in content.paths() for of in measurements_of_file(path)]
     text = _text((content.scene, content.points, dict(content.facts), content.results, measured))
     return text, (content.problems, content.unchecked)
 
