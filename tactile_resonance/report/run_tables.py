@@ -104,8 +104,8 @@ def table(names: Sequence[str], rows: Sequence[str]) -> str:
 
 
 def text_table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Table of texts, a row each."""
-    return table(names, [_row("td", names, row) for row in rows])
+    """Table of texts, a row each; nothing without one."""
+    return table(names, [_row("td", names, row) for row in rows]) if rows else ""
 
 
 def results_table(columns: Columns, results: Sequence[PointResult]) -> str:
@@ -148,7 +148,7 @@ def bands_table(results: Sequence[PointResult]) -> str:
                 band.poles_status,
             )
             rows.append(texts)
-    return text_table(names, rows) if rows else ""
+    return text_table(names, rows)
 
 
 def distortion_table(results: Sequence[PointResult]) -> str:
@@ -171,7 +171,7 @@ def distortion_table(results: Sequence[PointResult]) -> str:
                 _number(band.input_odd_db, 1),
             )
             rows.append(texts)
-    return text_table(names, rows) if rows else ""
+    return text_table(names, rows)
 
 
 def time_table(results: Sequence[PointResult]) -> str:

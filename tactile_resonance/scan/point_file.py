@@ -49,7 +49,7 @@ from tactile_resonance.scan.messages import (
 
 BAG_VERSION: Literal[9] = 9
 # rosbags parses the QoS of every topic of every file anew, 2 ms each: few texts differ
-storage_mcap.get_qos = cache(storage_mcap.get_qos)
+storage_mcap.parse_qos = cache(storage_mcap.parse_qos)  # type: ignore[assignment]
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # op and length, before the content
 _CRC = struct.Struct("<I")

@@ -105,9 +105,7 @@ def _read(entry: StoredEntry) -> StoredMeasurement:
     for measurement in measurements_of_file(entry.path):
         if measurement.measurement_id == entry.measurement_id:
             return measurement
-    raise ValueError(
-        f"measurement_id: {entry.measurement_id}, {entry.path.name} has no record of it"
-    )
+    raise ValueError(f"no record of measurement {entry.measurement_id} in {entry.path.name}")
 
 
 def recording_of_point(run: Path, result: PointResult) -> Recording:
@@ -118,13 +116,9 @@ def recording_of_point(run: Path, result: PointResult) -> Recording:
     ValueError
         If nothing was measured, or its record is not there or damaged.
     """
-    key = result.measurement_id
-    if not key:
+    if not result.measurement_id:
         raise ValueError(f"{result.outcome.name.lower()}, nothing was measured")
-    for measurement in measurements_of_file(file_of(run, result)):
-        if measurement.measurement_id == key:
-            return recording_of(measurement)
-    raise ValueError(f"no record of measurement {key}")
+    return recording_of(_read(StoredEntry(result.measurement_id, file_of(run, result), _read)))
 
 
 def recorded_results(run: RunContent) -> Iterator[bytes]:
