@@ -55,22 +55,13 @@ class Tissue:
         share = np.asarray(ratios) @ np.exp(-1 / np.asarray(times))
         require(bool(share < 1), "prony_ratios", ratios, "ratios that leave Einf above 0")
 
-    @property
-    def prony_moduli_pa(self) -> FloatArray:
-        """E_j [Pa], shape (terms,)."""
-        return self.relaxation_modulus_1s_pa * np.asarray(self.prony_ratios, dtype=float)
-
-    @property
-    def equilibrium_modulus_pa(self) -> float:
-        """Einf [Pa], from ``E(1 s) = Einf + sum E_j exp(-1 s / tau_j)``."""
-        left = np.exp(-1 / np.asarray(self.prony_times_s, dtype=float))
-        return float(self.relaxation_modulus_1s_pa - self.prony_moduli_pa @ left)
-
     @cached_property
     def prony(self) -> Prony:
-        """The series itself, with its moduli and compliance."""
-        times_s = np.array(self.prony_times_s)
-        return Prony(self.equilibrium_modulus_pa, self.prony_moduli_pa, times_s)
+        """The series, with Einf from ``E(1 s) = Einf + sum E_j exp(-1 s / tau_j)``."""
+        times_s = np.asarray(self.prony_times_s, dtype=float)
+        moduli_pa = self.relaxation_modulus_1s_pa * np.asarray(self.prony_ratios, dtype=float)
+        left_pa = float(self.relaxation_modulus_1s_pa - moduli_pa @ np.exp(-1 / times_s))
+        return Prony(left_pa, moduli_pa, times_s)
 
 
 @dataclass(frozen=True)
@@ -114,12 +105,12 @@ class HertzContact:
     @property
     def equilibrium_stiffness_n_per_m(self) -> float:
         """Stiffness at zero frequency [N/m]."""
-        return self.stiffness_factor_m * self.tissue.equilibrium_modulus_pa
+        return self.stiffness_factor_m * self.tissue.prony.equilibrium_pa
 
     @property
     def prony_stiffness_n_per_m(self) -> FloatArray:
         """Stiffness of each Prony term [N/m], shape (terms,)."""
-        return self.stiffness_factor_m * self.tissue.prony_moduli_pa
+        return self.stiffness_factor_m * self.tissue.prony.moduli_pa
 
     def dynamic_stiffness(self, s_rad_s: ArrayLike) -> ComplexArray:
         """Return ``k*(s)`` [N/m] at complex s [rad/s], of the shape of `s_rad_s`."""

@@ -145,9 +145,10 @@ class Indenter:
         require(0 <= work < np.inf, "adhesion_j_per_m2", work, "0 or above")
         self._radius = tip_radius_m
         self._scale = 2 / (1 - poisson_ratio**2)  # both halves of the row
-        moduli, times = tissue.prony_moduli_pa, np.asarray(tissue.prony_times_s)
-        moduli, times = moduli[moduli > 0], times[moduli > 0]
-        self._einf, self._e0 = tissue.equilibrium_modulus_pa, tissue.prony.instantaneous_pa
+        series = tissue.prony
+        acting = series.moduli_pa > 0
+        moduli, times = series.moduli_pa[acting], series.times_s[acting]
+        self._einf, self._e0 = series.equilibrium_pa, series.instantaneous_pa
         self._moduli, self._times = moduli.tolist(), times.tolist()
         # edge load / sqrt(x), as q (1 - nu^2)
         plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - poisson_ratio**2)

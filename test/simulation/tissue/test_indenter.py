@@ -44,8 +44,8 @@ def lee_radok(tissue, time, depth):
     late, early = (
         np.maximum(time[:, None] - edge, 0) for edge in (time[1:], time[:-1])
     )  # (T, T - 1): elapsed since the end and the start of each step
-    weight = tissue.equilibrium_modulus_pa * (early - late)
-    for modulus, tau in zip(tissue.prony_moduli_pa, tissue.prony_times_s, strict=True):
+    weight = tissue.prony.equilibrium_pa * (early - late)
+    for modulus, tau in zip(tissue.prony.moduli_pa, tissue.prony_times_s, strict=True):
         weight += modulus * tau * (np.exp(-late / tau) - np.exp(-early / tau))
     return 4 * np.sqrt(RADIUS) / (3 * (1 - POISSON**2)) * weight @ rate
 
@@ -70,11 +70,11 @@ def test_elastic_limit_is_hertz_on_every_way():
 
 def ting(tissue, peak, rise_s, times):
     """Force while unloading as fast as loading (Ting 1966), from its two integrals."""
-    moduli, taus = tissue.prony_moduli_pa, np.asarray(tissue.prony_times_s)
+    moduli, taus = tissue.prony.moduli_pa, np.asarray(tissue.prony_times_s)
 
     def weight(start, stop, t):
         late, early = np.exp(-(t - stop) / taus), np.exp(-(t - start) / taus)
-        return tissue.equilibrium_modulus_pa * (stop - start) + moduli * taus @ (late - early)
+        return tissue.prony.equilibrium_pa * (stop - start) + moduli * taus @ (late - early)
 
     force = []
     for t in times:
@@ -108,7 +108,7 @@ def test_unloading_is_that_of_ting(tissue):
 def row_of_springs(tissue, depth, dt, count=600):
     """Force by marching a row of independent springs, each touching or free, by brute force."""
     x = (np.arange(count) + 0.5) * 1.7e-3 / count
-    moduli = tissue.prony_moduli_pa[:, None]
+    moduli = tissue.prony.moduli_pa[:, None]
     decay = np.exp(-dt / np.asarray(tissue.prony_times_s))[:, None]
     u, z = np.zeros(count), np.zeros((moduli.size, count))
     force = []
@@ -122,7 +122,7 @@ def row_of_springs(tissue, depth, dt, count=600):
         z_held = decay * z + (1 - decay) * (held + u) / 2
         touching = held > free
         u, z = np.where(touching, held, free), np.where(touching, z_held, z_free)
-        load = tissue.equilibrium_modulus_pa * u + (moduli * (u - z)).sum(axis=0)
+        load = tissue.prony.equilibrium_pa * u + (moduli * (u - z)).sum(axis=0)
         force.append(2 / (1 - POISSON**2) * load[touching].sum() * (x[1] - x[0]))
     return np.array(force)
 
