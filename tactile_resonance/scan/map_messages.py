@@ -84,11 +84,14 @@ def marker_message(
     crosses = _marker(header, "failures", 0, "LINE_LIST")
     if pole_map.estimated:
         ellipses.scale.x = _LINE * pole_map.size_m
-        lines = pole_map.ellipses(scale, probability)  # (e, segments, 2, 3)
-        ellipses.points = _points(lines.reshape(-1, 3))
+        begun = pole_map.ellipses(scale, probability)[:, :, 0]  # (e, segments, 3)
+        corners = _points(begun.reshape(-1, 3))  # each begins one line and ends another
+        first = np.arange(len(corners)).reshape(begun.shape[:2])
+        ends = np.stack([first, np.roll(first, -1, axis=1)], axis=-1)  # (e, segments, 2)
+        ellipses.points = [corners[k] for k in ends.ravel().tolist()]
         own = shares([point.result.f0_hz for point in pole_map.with_ellipse], pole_map.f0_hz)
-        ends = lines[0].size // 3
-        ellipses.colors = [each for each in _colours(colours(own)) for _ in range(ends)]
+        each = 2 * begun.shape[1]
+        ellipses.colors = [rgba for rgba in _colours(colours(own)) for _ in range(each)]
     if pole_map.failures:
         crosses.scale.x = 2 * _LINE * pole_map.size_m
         arms = np.array([[-1, -1, 0], [1, 1, 0], [-1, 1, 0], [1, -1, 0]])

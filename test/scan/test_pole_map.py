@@ -17,7 +17,7 @@ from tactile_resonance.record import Contact, Origin
 from tactile_resonance.recording.messages import POLES_STATUS
 from tactile_resonance.scan.decision import Decision, Verdict
 from tactile_resonance.scan.hands import Measured
-from tactile_resonance.scan.map_messages import POINT, cloud_message
+from tactile_resonance.scan.map_messages import POINT, cloud_message, marker_message
 from tactile_resonance.scan.messages import header_message
 from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result, with_poles
 from tactile_resonance.scan.point_result import PointOutcome, PointResult, as_csv
@@ -28,6 +28,8 @@ from tactile_resonance.scan.pole_map import (
     GrowingMap,
     MapPoint,
     PoleMap,
+    colours,
+    shares,
 )
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass
 from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalContact
@@ -268,6 +270,18 @@ def test_the_scale_keeps_ellipses_apart_in_round_numbers():
     )
     assert PoleMap((bare,)).ellipse_scale().m_per_hz > 0
     assert PoleMap((bare,)).ellipses(EllipseScale(1, 1)).shape == (0, 36, 2, 3)
+    markers = marker_message(PoleMap((bare,)), EllipseScale(1, 1), 0.95, header_message("table", 1))
+    assert [marker.points for marker in markers.markers] == [[], []]
+
+
+def test_the_ellipses_of_a_message_are_those_of_the_map_in_their_colours():
+    found, scale = grid_map(3), EllipseScale(0.1, 20.0)
+    ellipses = marker_message(found, scale, 0.95, header_message("table", 1)).markers[0]
+    shown = np.array([[p.x, p.y, p.z] for p in ellipses.points]).reshape(-1, 36, 2, 3)
+    np.testing.assert_allclose(shown, found.ellipses(scale, 0.95), atol=1e-15)
+    rgb = np.array([[c.r, c.g, c.b] for c in ellipses.colors]).reshape(-1, 72, 3)
+    expected = colours(shares(found.f0_hz, found.f0_hz))
+    np.testing.assert_allclose(rgb, np.repeat(expected[:, None], 72, axis=1))
 
 
 def test_corners_of_many_small_ellipses_are_fewer_and_lie_on_them():
