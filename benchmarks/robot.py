@@ -132,7 +132,7 @@ def measure(seconds: float, repetitions: int, priority: int) -> LinkResult:
                 motions_s=np.array([stamped for _, stamped in pairs]),
                 arrivals_s=arrivals,
                 gaps_s=np.diff(stamps),
-                rate_hz=arm.rate_hz,
+                rate_hz=(len(stamps) - 1) / (stamps[-1] - stamps[0]),
                 cpu=cpu,
                 clock_uncertainty_s=arm.clock_uncertainty_s,
                 stalls=order(HOST, "state")["stalls"] - stalls,

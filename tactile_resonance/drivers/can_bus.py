@@ -27,6 +27,9 @@ _LONGEST_MESSAGE = 4096
 _AT_ONCE = 1 << 16
 _FRAME = re.compile(rb"<\s*(frame|error)\s+([^\s>]+)\s+([^\s>]+)([^>]*)>")
 
+EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
+"""Flags of identifiers (linux/can.h): of 29 bits; a request for data; an error reported by the interface."""
+
 
 class Frame(NamedTuple):
     """One frame of the bus.
@@ -34,22 +37,18 @@ class Frame(NamedTuple):
     Attributes
     ----------
     can_id : int
+        Identifier with its flags.
     data : bytes
     stamp_s : float
         Time stamp of the adapter [s].
     arrival_ns : int
         When it was taken from the interface (monotonic clock) [ns].
-    extended, remote, error : bool
-        Identifier of 29 bits; a request for data; an error reported by the interface.
     """
 
     can_id: int
     data: bytes
     stamp_s: float
     arrival_ns: int
-    extended: bool = False
-    remote: bool = False
-    error: bool = False
 
 
 class Bus(Protocol):
@@ -134,19 +133,22 @@ class SocketcandBus:
         self._buffer = received[end:]
         if len(self._buffer) > _LONGEST_MESSAGE:
             raise ConnectionError("the server sends a message without end")
-        arrival_ns = time.monotonic_ns()
-        frames = []
-        for message in _FRAME.findall(received, 0, end):
-            kind, number, stamp, text = message
-            is_error = kind == b"error"
-            try:
-                can_id, stamp_s = int(number, 16), float(stamp)
-                values = b"" if is_error else unhexlify(text.replace(b" ", b""))
-            except (ValueError, HexError) as error:
-                said = b" ".join(message).decode("ascii", "replace")
-                raise ConnectionError(f"the server sends {said!r}") from error
-            extended = len(number) > 3
-            frames.append(Frame(can_id, values, stamp_s, arrival_ns, extended, False, is_error))
+        found, arrival_ns = _FRAME.findall(received, 0, end), time.monotonic_ns()
+        try:
+            frames = [
+                Frame(
+                    int(number, 16) | (EXTENDED if len(number) > 3 else 0),
+                    unhexlify(text.replace(b" ", b"")),
+                    float(stamp),
+                    arrival_ns,
+                )
+                if kind == b"frame"
+                else Frame(int(number, 16) | EXTENDED | ERROR, b"", float(stamp), arrival_ns)
+                for kind, number, stamp, text in found
+            ]
+        except (ValueError, HexError) as error:
+            said = b" ".join(b" ".join(words) for words in found)[:200].decode("ascii", "replace")
+            raise ConnectionError(f"the server sends {said!r}") from error
         self.frames += len(frames)
         return frames
 
@@ -245,17 +247,11 @@ class AnyBus:
                 self.drained = message is None
                 if message is None:
                     continue
-                self._frames.append(
-                    Frame(
-                        message.arbitration_id,
-                        bytes(message.data),
-                        message.timestamp,
-                        time.monotonic_ns(),
-                        message.is_extended_id,
-                        message.is_remote_frame,
-                        message.is_error_frame,
-                    )
-                )
+                can_id = message.arbitration_id
+                can_id |= EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame
+                can_id |= ERROR * message.is_error_frame
+                data, now_ns = bytes(message.data), time.monotonic_ns()
+                self._frames.append(Frame(can_id, data, message.timestamp, now_ns))
                 self._came.set()
         except Exception as error:  # each interface has errors of its own
             self._error = error

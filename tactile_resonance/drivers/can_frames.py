@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import itemgetter
@@ -175,38 +175,30 @@ class CanDescription:
 
         None where the bytes are another answer.
         """
-        if len(data) != self.layout.size:
+        layout, constants, counts_of, overload_at, mask, plain = self._plan
+        if len(data) != layout.size:
             return None
-        values = self.layout.unpack(data)
-        for at, wanted in self._constants:
+        values = layout.unpack(data)
+        for at, wanted in constants:
             if values[at] != wanted:
                 return None
-        counts = self._counts_of(values)
-        over = self._overload_at is not None and bool(
-            values[self._overload_at] & self.overload.mask  # type: ignore[union-attr]
-        )
+        counts, over = counts_of(values), bool(values[overload_at] & mask) if mask else False
+        if -plain < min(counts) and max(counts) < plain:
+            return counts, over
         full_scale, invalid = self.full_scale_counts, self.invalid_counts
-        if full_scale is not None and (max(counts) >= full_scale or min(counts) <= -full_scale):
+        if full_scale is not None:
             over |= any(abs(count) >= full_scale and count not in invalid for count in counts)
-        if invalid and not self._invalid.isdisjoint(counts):
-            counts = tuple([math.nan if count in invalid else count for count in counts])
-        return counts, over
+        return tuple([math.nan if count in invalid else count for count in counts]), over
 
     @cached_property
-    def _counts_of(self) -> Callable[[tuple[float, ...]], tuple[float, ...]]:
-        return itemgetter(*map(self.fields.index, CHANNELS))
-
-    @cached_property
-    def _invalid(self) -> frozenset[int]:
-        return frozenset(self.invalid_counts)
-
-    @cached_property
-    def _constants(self) -> tuple[tuple[int, int], ...]:
-        return tuple((self.fields.index(name), value) for name, value in self.constant.items())
-
-    @cached_property
-    def _overload_at(self) -> int | None:
-        return None if self.overload is None else self.fields.index(self.overload.field)
+    def _plan(self) -> tuple:
+        """What `decode` needs of all this; last the count below which none has another meaning."""
+        place = self.fields.index
+        constants = tuple([(place(name), value) for name, value in self.constant.items()])
+        over = (0, 0) if self.overload is None else (place(self.overload.field), self.overload.mask)
+        special = [*self.invalid_counts, self.full_scale_counts]
+        plain = min([abs(count) for count in special if count is not None], default=math.inf)
+        return self.layout, constants, itemgetter(*map(place, CHANNELS)), *over, plain
 
 
 class Assembler:
@@ -228,9 +220,9 @@ class Assembler:
     """
 
     def __init__(self, frame_ids: tuple[int, ...], within_s: float) -> None:
-        self._ids, self._within_s = frame_ids, within_s
-        self._first_s = 0.0
-        self._parts: list[bytes] = []
+        self._place_of = {can_id: place for place, can_id in enumerate(frame_ids)}
+        self._within_s, self._first_s = within_s, 0.0
+        self._joined, self._count = b"", 0  # so far, and of how many frames
         self.lost = 0
 
     def add(self, can_id: int, data: bytes, time_s: float) -> bytes | None:
@@ -238,23 +230,23 @@ class Assembler:
 
         Frames of others are passed over.
         """
-        if can_id not in self._ids:
+        place = self._place_of.get(can_id)
+        if place is None:
             return None
-        parts, ids = self._parts, self._ids
-        late = bool(parts) and not abs(time_s - self._first_s) <= self._within_s
-        if can_id != ids[len(parts)] or late:
+        if place != self._count or (place and not abs(time_s - self._first_s) <= self._within_s):
             self.lost += 1
-            parts.clear()
-            if can_id != ids[0]:
-                return None
-        if not parts:
-            self._first_s = time_s
-        parts.append(data)
-        if len(parts) < len(ids):
+            self._count = 0
+        if place != self._count:
             return None
-        whole = b"".join(parts)
-        parts.clear()
-        return whole
+        if place == 0:
+            self._first_s, self._joined = time_s, data
+        else:
+            self._joined += data
+        self._count = place + 1
+        if self._count < len(self._place_of):
+            return None
+        self._count = 0
+        return self._joined
 
 
 def read_can_description(path: Path) -> CanDescription:

@@ -16,7 +16,16 @@ from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.clocks import STEP_S, ClockTracker
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
-from tactile_resonance.drivers.can_bus import Bus, Flow, Frame, SocketcandBus, one_line, open_bus
+from tactile_resonance.drivers.can_bus import (
+    ERROR,
+    EXTENDED,
+    Bus,
+    Flow,
+    Frame,
+    SocketcandBus,
+    one_line,
+    open_bus,
+)
 from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, CellCommand
 from tactile_resonance.drivers.force_config import CanForce
 
@@ -51,17 +60,22 @@ class CanWrench:
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._bus: Bus | None = None
         self._fault: ForceError | None = None
+        self._stamped = config.stamps == "adapter"
         self._scale = [tuple(map(float, row)) for row in config.scale]
         diagonal = [row[k] for k, row in enumerate(self._scale)]
         crosstalk = sum(map(abs, sum(self._scale, ()))) > sum(map(abs, diagonal))
         self._diagonal = None if crosstalk else diagonal
+        description = config.description
+        # of 11 and of 29 bits they are apart, also where their numbers are equal
+        flag = EXTENDED if description.extended_ids else 0
+        self._decode = description.decode
+        self._ids = tuple([can_id | flag for can_id in description.frame_ids])
         self._begin()
 
     @property
     def info(self) -> ForceInfo:
         """What the cell can do, and how well its times are known at present."""
-        arrival = self._config.stamps == "arrival"
-        std_s = self._config.delay_std_s if arrival else self._tracker.uncertainty_s
+        std_s = self._tracker.uncertainty_s if self._stamped else self._config.delay_std_s
         return replace(self._config.info, clock_uncertainty_s=std_s)
 
     @property
@@ -173,9 +187,8 @@ class CanWrench:
 
     def _new_assembler(self) -> Assembler:
         # times of arrival scatter by more than a period: there only the order pairs frames
-        adapter = self._config.stamps == "adapter"
-        within_s = 0.5 / self._config.info.rate_hz if adapter else math.inf
-        return Assembler(self._config.description.frame_ids, within_s)
+        within_s = 0.5 / self._config.info.rate_hz if self._stamped else math.inf
+        return Assembler(self._ids, within_s)
 
     def _send(self, bus: Bus, data: bytes) -> None:
         description = self._config.description
@@ -233,22 +246,22 @@ class CanWrench:
         frames = self._ahead + bus.read()
         self._ahead = []
         samples: list[CellSample] = []
-        silent_s, stamped = self._config.limits.silent_s, self._config.stamps == "adapter"
-        of_the_cell, assembler = self._is_of_the_cell, self._assembler
-        for frame in frames:
-            stamp_s = frame.stamp_s
-            if of_the_cell(frame):
-                lost = assembler.lost
-                whole = assembler.add(frame.can_id, frame.data, stamp_s)
-                if assembler.lost > lost:
-                    self._checks.lost()
-                sample = None if whole is None else self._wrench(whole, frame)
+        silent_s, ids, assembler = self._config.limits.silent_s, self._ids, self._assembler
+        lost = assembler.lost
+        for can_id, data, stamp_s, arrival_ns in frames:
+            whole = assembler.add(can_id, data, stamp_s)
+            if whole is not None:
+                sample = self._wrench(whole, stamp_s, arrival_ns)
                 if sample is not None:
                     samples.append(sample)
                     self._last_stamp_s = stamp_s
-            elif frame.error:
+            elif can_id in ids:
+                if assembler.lost > lost:
+                    lost += 1
+                    self._checks.lost()
+            elif can_id & ERROR:
                 raise ForceError(ForceFault.LINK_LOST, f"{self._where}: error frame")
-            elif stamped:
+            elif self._stamped:
                 # the bus is never empty, but the frames of others are already those of later
                 self._last_stamp_s = min(self._last_stamp_s, stamp_s)
                 if stamp_s - self._last_stamp_s > silent_s:
@@ -283,9 +296,9 @@ class CanWrench:
                 return ForceError(ForceFault.LINK_LOST, f"{text}: {one_line(error)}")
         return ForceError(ForceFault.SILENT, text)
 
-    def _wrench(self, whole: bytes, frame: Frame) -> CellSample | None:
+    def _wrench(self, whole: bytes, stamp_s: float, arrival_ns: int) -> CellSample | None:
         """The wrench of these joined bytes, None where they are another answer. Raises `ForceError`."""
-        decoded = self._config.description.decode(whole)
+        decoded = self._decode(whole)
         if decoded is None:
             return None
         counts, full_scale = decoded
@@ -298,29 +311,23 @@ class CanWrench:
             wrench = tuple([sum(map(mul, row, counts)) for row in self._scale])
         overload = self._checks.check(wrench, full_scale)
         self.received += 1
-        return CellSample(self._stamp_ns(frame), wrench, overload)
+        return CellSample(self._stamp_ns(stamp_s, arrival_ns), wrench, overload)
 
     def _is_of_the_cell(self, frame: Frame) -> bool:
-        """Identifiers of 11 and of 29 bits are apart, also where their numbers are equal."""
-        description = self._config.description
-        return (
-            frame.can_id in description.frame_ids
-            and frame.extended == description.extended_ids
-            and not frame.remote
-            and not frame.error
-        )
+        return frame.can_id in self._ids
 
-    def _stamp_ns(self, frame: Frame) -> int:
+    def _stamp_ns(self, stamp_s: float, arrival_ns: int) -> int:
         clock = self.clock
-        arrival_ns = clock.now_ns() if clock.simulated else frame.arrival_ns
-        if self._config.stamps == "arrival":
+        if clock.simulated:
+            arrival_ns = clock.now_ns()
+        if not self._stamped:
             delay_s = self._config.shortest_delay_s + self._config.latency_s
             # those that were taken together came one after the other
             stamp_ns = max(arrival_ns - round(delay_s * 1e9), self._stamp_before_ns + 1)
             self._stamp_before_ns = stamp_ns
             return stamp_ns
-        self._tracker.add(frame.stamp_s, arrival_ns)
-        stamp_ns = self._tracker.to_local_ns(frame.stamp_s)
+        self._tracker.add(stamp_s, arrival_ns)
+        stamp_ns = self._tracker.to_local_ns(stamp_s)
         # a relation that has become better may be earlier by more than a period, but the order in which
         # the wrenches were taken is certain; a step is none of the relation's, and left to be seen
         if 0 <= self._stamp_before_ns - stamp_ns < STEP_S * 1e9:

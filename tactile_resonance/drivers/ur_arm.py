@@ -104,13 +104,6 @@ class UrArm:
         return self._states.clock_std_s
 
     @property
-    def rate_hz(self) -> float:
-        """States received in the last second."""
-        self._fresh()
-        assert self._states is not None
-        return self._states.rate_hz
-
-    @property
     def client_pid(self) -> int | None:
         """Id of the client's process; None while none runs."""
         return None if self._client is None else self._client.pid
@@ -132,7 +125,7 @@ class UrArm:
         if self._client is not None and self._connect_again():
             return
         self._begin()
-        client = ClientProcess(self.config)
+        client = ClientProcess(self.config, simulated_time=bool(self._time.address))
         names = {"time": self._time.address, "time_name": self._time.client_name}
         self._ask({"name": "connect", "config": self.config.to_dict(), **names}, client)
         if self._time.led is not None:
@@ -151,7 +144,8 @@ class UrArm:
             refused, or where the client does not answer.
         """
         sample = self._fresh()
-        self._check_commands()
+        if self._sent:
+            self._check_commands()
         return sample
 
     def recent(self) -> ArmSample:
@@ -440,10 +434,7 @@ class UrArm:
     def _check_commands(self) -> None:
         assert self._client is not None
         assert self._states is not None
-        if not self._sent:
-            return
-        exchange, sent = self._client.exchange, self._sent
-        done, refused = exchange.done, exchange.refused
+        sent, (done, refused) = self._sent, self._client.exchange.answered
         while sent and sent[0][0] <= done:
             number, kind, _ = sent.popleft()
             if number != refused or number <= self._refused:

@@ -23,7 +23,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from itertools import zip_longest
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError
@@ -66,6 +66,9 @@ class Client:
         self._led = False  # the owner states how far simulated time may go
         self._fed_ns = 0  # when the watchdog was fed, by a velocity too, in simulated time or this machine's
         self._until_ns = 0  # up to when simulated time may go on
+        self._fed = (
+            False  # the newest message was a velocity that the robot took, which feeds its watchdog
+        )
         # number and deceleration of a stop that the robot has not taken yet
         self._owed: tuple[int, float] | None = None
 
@@ -78,7 +81,7 @@ class Client:
                         self._request(json.loads(message))
                     else:
                         self._obey(UrCommand.unpack(message))
-                if self._session is not None:
+                if self._session is not None and not self._fed:
                     self._keep_alive(self._session)
         except OwnerGoneError:
             self._leave()
@@ -95,6 +98,7 @@ class Client:
                 select.select([self._commands, self._clock], [], [])
                 pause_ms = 0
         messages: list[bytes] = []
+        self._fed = False
         ready = self._told.poll(pause_ms)
         while ready:
             try:
@@ -122,11 +126,11 @@ class Client:
             self._owed = command.number, command.acceleration
             self._pay(session)
         elif command.kind == SPEED:
-            done = self._do(lambda: session.motion.speed(command.twist, command.acceleration))
+            done = self._do(session.motion.speed, command.twist, command.acceleration)
             if done:
                 self._owed = None
                 if self._clock is None:
-                    self._fed_ns = time.monotonic_ns()
+                    self._fed, self._fed_ns = True, time.monotonic_ns()
             self._exchange.report(command.number, done)
         if command.until_ns and self._clock is not None:
             # the owner sends this when the time that it sent last is reached
@@ -207,9 +211,9 @@ class Client:
         """Whether the owner sees that the robot's state forbids motion."""
         return bool(self._exchange.seen & FAULTY) and self._healthy
 
-    def _do(self, action: Callable[[], bool]) -> bool:
+    def _do(self, action: Callable[..., bool], *arguments: Any) -> bool:
         try:
-            done = action()
+            done = action(*arguments)
         except Exception as error:  # the library documents no exceptions; the owner reads the text
             print(f"{action}: {error}", file=sys.stderr)
             done = False
@@ -224,13 +228,13 @@ class Client:
             return
         (number, deceleration), seen = self._owed, self._exchange.seen
         if not seen & FAULTY:
-            done = self._do(lambda: session.motion.stop(deceleration))
+            done = self._do(session.motion.stop, deceleration)
             self._exchange.report(number, done)
             if done:
                 self._owed = None
             return
         self._exchange.report(number, True)  # nothing runs that could be stopped
-        if seen & REVIVED and self._do(lambda: session.motion.stop(deceleration)):
+        if seen & REVIVED and self._do(session.motion.stop, deceleration):
             # a program that went on, or began, without us finds the old velocity in its register
             self._owed = None
 

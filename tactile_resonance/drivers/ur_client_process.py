@@ -21,6 +21,8 @@ from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import EXIT_LINK_LOST, SIZE, Exchange, UrCommand
 
 GRACE_S = 1.5
+PROBES_NS = 10_000_000
+"""So often it is asked whether the process runs [ns]; a command that is sent to a dead one finds it at once."""
 # Of what ur_rtde 1.6.5 writes when it finds its connection lost.
 LIBRARY_LOST = "Robot is disconnected"
 
@@ -31,6 +33,8 @@ class ClientProcess:
     Parameters
     ----------
     config : UrArmConfig
+    simulated_time : bool
+        Which may go on far between two looks.
 
     Attributes
     ----------
@@ -43,7 +47,7 @@ class ClientProcess:
         CLIENT_DIED where ur_rtde is not installed.
     """
 
-    def __init__(self, config: UrArmConfig) -> None:
+    def __init__(self, config: UrArmConfig, *, simulated_time: bool = False) -> None:
         if find_spec("rtde_control") is None:
             raise ArmError(
                 ArmFault.CLIENT_DIED, "ur_rtde is not installed: pip install 'ur-rtde>=1.6.5,<1.7'"
@@ -51,6 +55,7 @@ class ClientProcess:
         self._host, self._connect_timeout_s = config.host, config.connect_timeout_s
         self._using = threading.Lock()  # one thread may end it while another waits for it
         self._ended = False
+        self._probed_ns, self._probes_ns = 0, 0 if simulated_time else PROBES_NS
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with tempfile.TemporaryFile() as page, theirs:
             page.truncate(SIZE)
@@ -81,13 +86,15 @@ class ClientProcess:
     def look(self, seen: int | None = None) -> None:
         """Give the client a sign of life and what is seen of the robot; `ArmError` where the client is gone."""
         with self._using:
-            if not self._ended and self._runs():
-                self.exchange.beat(seen)
-                return
+            if not self._ended:
+                now_ns = self.exchange.beat(seen)
+                if now_ns - self._probed_ns < self._probes_ns or self._runs():
+                    return
         raise self._death()
 
     def _runs(self) -> bool:
         """Whether the process has not ended; one call of the system, and it stays to be waited for."""
+        self._probed_ns = time.monotonic_ns()
         how = os.WEXITED | os.WNOHANG | os.WNOWAIT
         try:
             return self._process.returncode is None and os.waitid(os.P_PID, self.pid, how) is None

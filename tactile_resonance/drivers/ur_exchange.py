@@ -12,7 +12,7 @@ import time
 from typing import NamedTuple
 
 SIZE = mmap.PAGESIZE
-_VALUE = struct.Struct("<q")
+_VALUE, _PAIR = struct.Struct("<q"), struct.Struct("<qq")
 _BEAT, _SEEN, _DONE, _REFUSED, _HEARD = 0, 8, 16, 24, 32
 
 SPEED, STOP, NOTHING = b"s", b"t", b"-"
@@ -72,12 +72,19 @@ class Exchange:
 
     def __init__(self, descriptor: int) -> None:
         self._page = mmap.mmap(descriptor, SIZE)
+        self._reported = 0
 
-    def beat(self, seen: int | None = None) -> None:
-        """Owner: give a sign of life, and state what is seen of the robot: `FRESH`, `FAULTY`, `REVIVED`."""
-        if seen is not None:
-            self._write(_SEEN, seen)
-        self._write(_BEAT, time.monotonic_ns())
+    def beat(self, seen: int | None = None) -> int:
+        """Owner: give a sign of life, and state what is seen of the robot: `FRESH`, `FAULTY`, `REVIVED`.
+
+        Returns when, by this machine's monotonic clock [ns].
+        """
+        now_ns = time.monotonic_ns()
+        if seen is None:
+            self._write(_BEAT, now_ns)
+        else:
+            _PAIR.pack_into(self._page, _BEAT, now_ns, seen)
+        return now_ns
 
     def silence_s(self) -> float:
         """Client: time since the owner's last sign of life [s]."""
@@ -92,17 +99,14 @@ class Exchange:
         """Client: report that a command was done, or refused."""
         if not done:
             self._write(_REFUSED, number)
-        self._write(_DONE, max(number, self._read(_DONE)))
+        self._reported = max(number, self._reported)
+        self._write(_DONE, self._reported)
 
     @property
-    def done(self) -> int:
-        """Owner: number of the last command that was done or refused; 0: none."""
-        return self._read(_DONE)
-
-    @property
-    def refused(self) -> int:
-        """Owner: number of the last command that was refused; 0: none."""
-        return self._read(_REFUSED)
+    def answered(self) -> tuple[int, int]:
+        """Owner: numbers of the last command that was done or refused, and of the last refused; 0: none."""
+        done, refused = _PAIR.unpack_from(self._page, _DONE)
+        return done, refused
 
     def hear(self, until_ns: int) -> None:
         """Client: state the time up to which it has let simulated time go on for the owner."""

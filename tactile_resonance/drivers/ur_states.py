@@ -7,7 +7,6 @@ Numbers of modes and status bits: Universal Robots, "Real-Time Data Exchange (RT
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -91,18 +90,12 @@ class StateReader:
         self.fault: tuple[ArmFault, str] | None = None
         self._stream, self._now_ns, self._trip_s = stream, now_ns, round_trip_s
         self._tracker = self._new_tracker()
-        self._stamps: deque[float] = deque()
         self._guarded = self._ended = False
 
     @property
     def clock_std_s(self) -> float:
         """Standard deviation of the states' times [s]."""
         return self._tracker.uncertainty_s
-
-    @property
-    def rate_hz(self) -> float:
-        """States received of the last second of the robot's time."""
-        return float(len(self._stamps))
 
     @property
     def revived(self) -> bool:
@@ -124,22 +117,16 @@ class StateReader:
         Where the present time is not known, states are dated by the relation of the clocks found before.
         """
         states = self._stream.read()
-        last_s = -math.inf if self.newest is None else self.newest.robot_time_s
+        if not states:
+            return False
+        if self._guarded:
+            for state in states:
+                if state.runtime_state != PROGRAM_PLAYING:
+                    self._ended = True
+        before, self.newest = self.newest, states[-1]
         # a robot whose simulated time stands repeats its state
-        newest, stamps = None, self._stamps
-        for state in states:
-            if state.robot_time_s == last_s:
-                continue
-            newest = state
-            if self._guarded and state.runtime_state != PROGRAM_PLAYING:
-                self._ended = True
-            stamps.append(state.robot_time_s)
-        if newest is None:
-            return bool(states)
-        self.newest, now_s = newest, newest.robot_time_s
-        while not now_s - 1.0 <= stamps[0] <= now_s:
-            stamps.popleft()
-        self._date(newest, now_known)
+        if before is None or self.newest.robot_time_s != before.robot_time_s:
+            self._date(self.newest, now_known)
         return True
 
     def date_anew(self) -> None:

@@ -10,7 +10,6 @@ from tactile_resonance.drivers.force_config import read_force_config
 
 pytest.importorskip("can", reason="python-can is not installed")
 
-from tactile_resonance.drivers.can_bus import Frame
 from tactile_resonance.drivers.can_wrench import CanWrench
 
 PERIOD_NS = 1_000_000
@@ -27,9 +26,7 @@ def stamps(delay_ns, ahead_s=0.0):
     told = []
     for n, (delay, ahead) in enumerate(zip(*np.broadcast_arrays(delay_ns, ahead_s), strict=True)):
         stamp_s = n * PERIOD_NS * 1e-9 + float(ahead)
-        told.append(
-            driver._stamp_ns(Frame(0x002, b"", stamp_s, START_NS + n * PERIOD_NS + int(delay)))
-        )
+        told.append(driver._stamp_ns(stamp_s, START_NS + n * PERIOD_NS + int(delay)))
     return np.array(told)
 
 
