@@ -29,12 +29,11 @@ class NormalRows:
     def __init__(self, seed: Seed, rms: Sequence[float]) -> None:
         self._random = np.random.default_rng(seed)
         self._rms = np.array(rms)  # (width,)
-        self._left: list[list[float]] = []  # the next row last
+        self._left: list[tuple[float, ...]] = []  # the next row last
 
-    def take(self) -> list[float]:
+    def take(self) -> tuple[float, ...]:
         """Return the next row."""
         if not self._left:
             numbers = self._rms * self._random.standard_normal((ROWS, self._rms.size))
-            self._left = numbers.tolist()
-            self._left.reverse()
+            self._left = [tuple(row) for row in reversed(numbers.tolist())]
         return self._left.pop()

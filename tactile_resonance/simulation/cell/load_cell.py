@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable
-from operator import sub
 from typing import NamedTuple
 
 from tactile_resonance.simulation.cell.transducer import (
@@ -73,8 +72,9 @@ class LoadCell:
         self._decimation = _decimation(0)
         self._time_s: float | None = None
         self._ticks = self._sent = 0
-        self._wrench = [0.0] * 6
-        self._counts, self._bits = [0] * 6, 0
+        self._wrench: tuple[float, ...] = (0.0,) * 6
+        self._counts: tuple[int, ...] = (0,) * 6
+        self._bits = 0
 
     @property
     def faults(self) -> CellFaults:
@@ -100,28 +100,23 @@ class LoadCell:
         list of CanFrame
             Sent meanwhile, oldest first.
         """
-        load = list(map(float, wrench))
+        load = tuple(map(float, wrench))
         if self._time_s is None:
             self._time_s, self._wrench = time_s, load
-        span = time_s - self._time_s
-        steady = load == self._wrench
-        change = list(map(sub, load, self._wrench))
+        before, start_s, span_s = self._wrench, self._time_s, time_s - self._time_s
         frames: list[CanFrame] = []
-        period = SAMPLE_PERIOD_S
-        start_s, now = self._time_s, load
-        while self._time_s + period <= time_s + 1e-9:
-            self._time_s += period
-            if not steady:
-                part = (self._time_s - start_s) / span
-                now = [old + part * way for old, way in zip(self._wrench, change, strict=True)]
-            self._counts, self._bits = self._transducer.convert(now)
+        while self._time_s + SAMPLE_PERIOD_S <= time_s + 1e-9:
+            self._time_s += SAMPLE_PERIOD_S
+            part = (self._time_s - start_s) / span_s
+            self._counts, self._bits = self._transducer.convert(load, before, part)
             self._ticks += 1
             if self.streaming and self._ticks % self._decimation == 0:
                 frames += self._wrench_frames(START, self._time_s)
-        # what is left of the span counts for the next call
-        if not steady:
-            left = (time_s - self._time_s) / span if span > 0 else 0.0
-            self._wrench = [new - left * way for new, way in zip(load, change, strict=True)]
+        if load != before:
+            # what is left of the span counts for the next call
+            left = (time_s - self._time_s) / span_s if span_s > 0 else 0.0
+            pairs = zip(load, before, strict=True)
+            self._wrench = tuple([new - left * (new - old) for new, old in pairs])
         return frames
 
     def receive(self, can_id: int, data: bytes) -> list[CanFrame]:

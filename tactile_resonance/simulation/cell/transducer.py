@@ -4,14 +4,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from operator import add
 from pathlib import Path
+
+import numpy as np
+from numba import boolean, float64, from_dtype, int64, njit
+from numba.types import UniTuple
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import check_above_zero, check_not_negative, read_file, require
 from tactile_resonance.simulation.noise import NormalRows, Seed
+from tactile_resonance.simulation.ur5e.poses import Six
+
+Counts = tuple[int, ...]
+"""Of the six axes."""
 
 SAMPLE_PERIOD_S = 0.001
 """The cell converts at 1 kHz, the fastest rate that it can send."""
@@ -103,6 +109,55 @@ class CellFaults:
         setattr(self, name, kinds[name](value))
 
 
+AXES = np.dtype(
+    [
+        *[(name, float) for name in ("range", "divisor", "drift", "offset")],
+        # what the bias command takes off; of the newest reading, filtered
+        *[(name, float) for name in ("zero", "signal", "noise")],
+        *[(name, np.int64) for name in ("count", "overloaded", "overloads")],
+    ]
+)
+"""What there is for each axis; of a load beyond the range: whether it is now, and how often it began."""
+
+
+@njit(
+    UniTuple(int64, 7)(
+        *(from_dtype(AXES)[::1], *[UniTuple(float64, 6)] * 2, float64, UniTuple(float64, 6)),
+        *(*[float64] * 3, boolean, float64, boolean),
+    ),
+    cache=True,
+)
+def _convert(
+    axes, before, load, part, noise, keep, signal_keep, noise_keep, flipped, bias_step_n, stuck
+):
+    """See `Transducer.convert`; behind the low-pass noise begins anywhere in its stationary state."""
+    bits = 0
+    for k in range(6):
+        axis, now = axes[k], before[k] + part * (load[k] - before[k])
+        axis.offset += axis.drift
+        signal = now + axis.offset
+        if flipped:  # the bias turns with the sign too
+            signal = -signal
+        if k == 2:
+            signal += bias_step_n
+        if noise_keep < 0.0:
+            axis.noise = math.sqrt((1 - keep) / (1 + keep)) * noise[k]
+        else:
+            axis.noise = noise_keep * axis.noise + (1 - noise_keep) * noise[k]
+        axis.signal = signal_keep * axis.signal + (1 - signal_keep) * signal
+        if not stuck:
+            count = (axis.signal + axis.noise - axis.zero) * axis.divisor
+            axis.count = int(np.rint(max(-LARGEST_COUNT, min(LARGEST_COUNT, count))))
+        over = abs(now) > axis.range
+        axis.overloads += over and not axis.overloaded
+        axis.overloaded = over
+        bits = bits << 1 | over
+    return (
+        *(axes[0].count, axes[1].count, axes[2].count, axes[3].count, axes[4].count),
+        *(axes[5].count, bits),
+    )
+
+
 class Transducer:
     """Wrenches in, counts out, at a fixed period.
 
@@ -115,31 +170,26 @@ class Transducer:
     Attributes
     ----------
     faults : CellFaults
-    overload_counts : list of 6 int
-        How often each axis went beyond its range.
     """
 
     def __init__(self, parameters: CellParameters, seed: Seed = 1) -> None:
         self.parameters = parameters
         self.faults = CellFaults()
-        self.overload_counts = [0] * 6
         p = parameters
         self._noise_rms = [p.force_noise_rms_n] * 3 + [p.torque_noise_rms_nm] * 3
-        self._range = [p.force_range_n] * 3 + [p.torque_range_nm] * 3
-        self._least_range = min(self._range)
-        self._divisor = [p.force_divisor] * 3 + [p.torque_divisor] * 3
-        self._drift = [p.force_drift_n_per_s * SAMPLE_PERIOD_S] * 3 + [0.0] * 3
-        self._drifts = any(self._drift)
-        self._offset = [*p.force_bias_n, *p.torque_bias_nm]
-        self._zero = [0.0] * 6  # what the bias command subtracts
-        # of the newest reading, filtered
-        self._signal: list[float] | None = None
-        self._noise = [0.0] * 6
-        self._overloaded = 0
-        self._counts = [0] * 6
-        self._keep = 0.0
+        self._axes = np.zeros(6, AXES)
+        self._axes["range"] = [p.force_range_n] * 3 + [p.torque_range_nm] * 3
+        self._axes["divisor"] = [p.force_divisor] * 3 + [p.torque_divisor] * 3
+        self._axes["drift"] = [p.force_drift_n_per_s * SAMPLE_PERIOD_S] * 3 + [0.0] * 3
+        self._axes["offset"] = [*p.force_bias_n, *p.torque_bias_nm]
+        self._read = False  # whether there is a reading
         self.cutoff_hz = 0.0
         self.reseed(seed)
+
+    @property
+    def overload_counts(self) -> list[int]:
+        """How often each axis went beyond its range, (6,)."""
+        return self._axes["overloads"].tolist()
 
     @property
     def cutoff_hz(self) -> float:
@@ -158,63 +208,31 @@ class Transducer:
 
     def set_zero(self, on: bool) -> None:
         """Take the present reading as zero, or end that."""
-        self._zero = [0.0] * 6
-        if on and self._signal is not None:
-            self._zero = list(map(add, self._signal, self._noise))
+        self._axes["zero"] = self._axes["signal"] + self._axes["noise"] if on else 0.0
 
-    def convert(self, wrench: Sequence[float]) -> tuple[list[int], int]:
+    def convert(
+        self, load: Six, before: Six | None = None, part: float = 1.0
+    ) -> tuple[Counts, int]:
         """Convert once: from the wrench on the cell, 6 [N, N m], to six counts and overload bits.
 
         Bit 5 belongs to Fx, bit 0 to Tz.
+
+        Parameters
+        ----------
+        load, before : 6 floats
+            At the end of some time, and where that is not all of it at its beginning.
+        part : float
+            Of that time that is over.
         """
-        faults = self.faults
-        if self._drifts:
-            self._offset = list(map(add, self._offset, self._drift))
-        signal = list(map(add, wrench, self._offset))
-        if faults.flipped:  # the bias turns with the sign too
-            signal = [-value for value in signal]
-        signal[2] += faults.bias_step_n
-        noise = self._rows.take()
-        if self._keep:
-            signal, noise = self._through_filter(signal, noise)
-        self._signal, self._noise, self._noise_begins = signal, noise, False
-        if not faults.stuck:
-            parts = zip(signal, noise, self._zero, self._divisor, strict=True)
-            counts = [(value + n - zero) * divisor for value, n, zero, divisor in parts]
-            if max(counts) > LARGEST_COUNT or min(counts) < -LARGEST_COUNT:
-                counts = [max(-LARGEST_COUNT, min(LARGEST_COUNT, count)) for count in counts]
-            self._counts = list(map(round, counts))
-        result = list(self._counts)
-        if faults.saturated:
-            result[2] = LARGEST_COUNT
-        if faults.invalid:
-            result[2] = NO_NUMBER
-        return result, self._overload_bits(wrench)
-
-    def _through_filter(
-        self, signal: list[float], noise: list[float]
-    ) -> tuple[list[float], list[float]]:
-        """Return signal and noise behind the low-pass; noise begins anywhere in its stationary state."""
-        keep, take = self._keep, 1 - self._keep
-        if self._noise_begins:
-            noise = [math.sqrt((1 - keep) / (1 + keep)) * n for n in noise]
-        else:
-            noise = [keep * old + take * n for old, n in zip(self._noise, noise, strict=True)]
-        if self._signal is not None:
-            pairs = zip(self._signal, signal, strict=True)
-            signal = [keep * old + take * value for old, value in pairs]
-        return signal, noise
-
-    def _overload_bits(self, wrench: Sequence[float]) -> int:
-        bits, least = 0, self._least_range
-        if max(wrench) <= least and -min(wrench) <= least:
-            self._overloaded = 0
-            return 0
-        for load, most in zip(wrench, self._range, strict=True):
-            bits = bits << 1 | (abs(load) > most)
-        begun = bits & ~self._overloaded
-        if begun:
-            for axis in range(6):
-                self.overload_counts[axis] += begun >> (5 - axis) & 1
-        self._overloaded = bits
-        return bits
+        faults, keep = self.faults, self._keep
+        signal_keep = keep if self._read else 0.0
+        noise_keep = -1.0 if self._noise_begins else keep
+        self._read, self._noise_begins = True, False
+        converted = _convert(
+            *(self._axes, load if before is None else before, load, part, self._rows.take()),
+            *(keep, signal_keep, noise_keep, faults.flipped, faults.bias_step_n, faults.stuck),
+        )
+        counts, bits = converted[:6], converted[6]
+        if faults.saturated or faults.invalid:
+            counts = (*counts[:2], NO_NUMBER if faults.invalid else LARGEST_COUNT, *counts[3:])
+        return counts, bits

@@ -129,6 +129,9 @@ class BenchTime:
         Steps on the wall clock that began more than 10 ms late.
     longest_delay_s : float
         Of a step on the wall clock [s].
+    at_once : callable
+        On the wall clock: how many steps may be made together, when the last of them is due, because nobody
+        needs each of them at its time.
     """
 
     def __init__(self, reactor: Reactor, step_ns: int, *, simulated: bool) -> None:
@@ -140,6 +143,7 @@ class BenchTime:
         self.robot_sent_ns: Callable[[int], int] = lambda port: 0
         self.frames_sent: Callable[[int], int] = lambda port: 0
         self.packets_arrived: Callable[[], int | None] = lambda: None
+        self.at_once: Callable[[], int] = lambda: 1
         self.stalls, self.longest_delay_s = 0, 0.0
         self.simulated = simulated
         self._reactor, self._step_ns = reactor, step_ns
@@ -229,7 +233,7 @@ class BenchTime:
             self._run_on_the_wall_clock()
 
     def _run_on_the_wall_clock(self) -> None:
-        due_ns = time.perf_counter_ns()
+        due_ns, steps = time.perf_counter_ns(), 1
         while not self._stopping:
             wait_ns = due_ns - time.perf_counter_ns()
             if wait_ns > 0:
@@ -237,7 +241,12 @@ class BenchTime:
                 continue
             self._reactor.serve(0.0)
             due_ns = self._next_due(due_ns, time.perf_counter_ns())
-            self._step()
+            self._reactor.gathers = steps > 1
+            for _ in range(steps):
+                self._step()
+            self._reactor.gathers = False
+            steps = self.at_once()
+            due_ns += (steps - 1) * self._step_ns
 
     def _run_simulated(self) -> None:
         due_ns = time.perf_counter_ns()

@@ -173,6 +173,7 @@ class Plant:
         self._cell_turn = turn_from_vector(vector(cell.frame.rotation_rad))
         self._gravity_m_s2 = vector(GRAVITY_M_S2)
         self._places: list[Vector] = []  # of the carried mass, newest last
+        self._unloaded: tuple[Vector, Vector] | None = None  # what a cell that stands feels then
         self._period_s = 0.0
 
     def step(self, tip: Transform, dt_s: float) -> None:
@@ -224,6 +225,9 @@ class Plant:
         """
         if not self._stepped:
             raise RuntimeError("wrench_at_cell: the plant has not been stepped yet")
+        untouched = self.force_n is ORIGIN and self.mounting.mount is Mount.TABLE
+        if untouched and self._unloaded is not None:
+            return self._unloaded
         mass = self.mounting.carried_kg
         gx, gy, gz = self._gravity_m_s2
         cx, cy, cz = self.torque_nm
@@ -240,10 +244,13 @@ class Plant:
         load = (mass * gx, mass * gy, mass * gz)
         tx, ty, tz = cross(difference(self.tip_m, origin), (fx, fy, fz))
         lx, ly, lz = cross(difference(centre, origin), load)
-        return (
+        wrench = (
             rotated_back(turn, (fx + load[0], fy + load[1], fz + load[2])),
             rotated_back(turn, (cx + tx + lx, cy + ty + ly, cz + tz + lz)),
         )
+        if untouched:
+            self._unloaded = wrench
+        return wrench
 
     def _find_tissue(self, place: Vector, height: float, normal: Vector, way: Vector) -> None:
         """Tissue remembers a touch at the same place; elsewhere it is fresh, and what lies exactly there."""

@@ -121,6 +121,9 @@ class ScriptService:
 
 _LONGEST_FREEZE_S = 600.0
 
+STEPS_AT_REST = 3
+"""While nothing moves or is touched states come so many at a time, so that the newest is at most 6 ms old."""
+
 
 class SimulatedRobot:
     """A controller with RTDE, dashboard, script and control ports, and that of its time.
@@ -169,6 +172,7 @@ class SimulatedRobot:
         self.reactor = Reactor(host)
         self.time = BenchTime(self.reactor, round(CYCLE_S * 1e9), simulated=simulated_time)
         self.time.steps.append(self._step)
+        self.time.at_once = lambda: STEPS_AT_REST if controller.rests else 1
         self.time.repeats.append(self.rtde.repeat)
         self.time.stalled.append(self._stood_still)
         self.time.robot_sent_ns = self.rtde.sent_ns

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil, cos, exp, sin, sqrt
+from math import ceil, sqrt
 from typing import Protocol
 
 import numpy as np
@@ -15,13 +16,13 @@ from tactile_resonance.fields import require
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
 from tactile_resonance.simulation.sensor.bimorph import BeamModes
 from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.indenter import Ball, Indenter
+from tactile_resonance.simulation.tissue.indenter import Ball, Beam, Indenter, Motion, swing
 
 UP_M = 1e-7
 """Over which the slope of a pull is taken [m]."""
 
 
-class OnSoft:
+class OnSoft(ABC):
     """A ball on soft tissue that something else acts on, too."""
 
     def __init__(self, soft: Indenter) -> None:
@@ -36,6 +37,23 @@ class OnSoft:
     def contact_radius_m(self) -> float:
         """On the soft tissue [m]."""
         return self._soft.contact_radius_m
+
+    @abstractmethod
+    def step(self, depth_m: float, dt_s: float) -> float:
+        """Move the ball to a depth within a time; return the force [N]."""
+
+    @abstractmethod
+    def tangent(self, dt_s: float) -> tuple[float, float]:
+        """Force after holding for a time [N], and per further depth [N/m]."""
+
+    def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
+        """See `Ball`."""
+        base_m, rate_m_s = base
+        for n in range(count):
+            base_now_m = base_m + n * h_s * rate_m_s
+            ball = swing(*self.tangent(h_s), *ball, base_now_m, rate_m_s, h_s, *beam)
+            self.step(ball[0], h_s)
+        return ball
 
 
 class OnBone(OnSoft):
@@ -198,9 +216,7 @@ class SprungIndenter:
         good = 0 <= c < 2 * sqrt(k * m)
         require(good, "damping_ns_per_m", c, "0 to below 2 sqrt(stiffness mass)")
         self.indenter = indenter
-        self._stiffness, self._mass, self._damping = k, m, c
-        self._swing_of = 0.0, 0.0  # stiffness and sub-step of the swing that was computed last
-        self._swing = 0.0, 0.0
+        self._beam = k, c, m
         # the first step begins at rest, with the beam straight
         self.force_n = 0.0
         self.tip_depth_m = -np.inf
@@ -225,28 +241,13 @@ class SprungIndenter:
             require(False, "dt_s", dt_s, "a number above 0")
         if self._base is None:
             self._base = self.tip_depth_m = base_depth_m
-        k, c, m, ball = self._stiffness, self._damping, self._mass, self.indenter
-        depth, speed = self.tip_depth_m, self._speed
         count = ceil(dt_s / SUBSTEP_S - 1e-9)
-        h, rate = dt_s / count, (base_depth_m - self._base) / dt_s
-        half = c / (2 * m)
-        fall = exp(-half * h)
-        for n in range(count):
-            held, tangent = ball.tangent(h)
-            whole = k + tangent
-            # motion of equilibrium: offset + drift t
-            drift = k * rate / whole
-            offset = k * (self._base + n * h * rate) + c * (rate - drift) - held + tangent * depth
-            offset /= whole
-            y, dy = depth - offset, speed - drift
-            if (whole, h) != self._swing_of:
-                omega = sqrt(whole / m - half * half)
-                self._swing_of, self._swing = (whole, h), (cos(omega * h), sin(omega * h) / omega)
-            turn, lift = self._swing
-            depth = offset + drift * h + fall * (y * turn + (dy + half * y) * lift)
-            speed = drift + fall * (dy * turn - (whole / m * y + half * dy) * lift)
-            ball.step(depth, h)
+        rate = (base_depth_m - self._base) / dt_s
+        depth, speed = self.indenter.swing(
+            self._beam, (self._base, rate), (self.tip_depth_m, self._speed), dt_s / count, count
+        )
         self._base, self.tip_depth_m, self._speed = base_depth_m, depth, speed
+        k, c, _ = self._beam
         self.force_n = k * (base_depth_m - depth) + c * (rate - speed)
         return self.force_n
 

@@ -131,6 +131,11 @@ class UrController:
         """
         self.machine.reseed(np.random.default_rng(seed))
 
+    @property
+    def rests(self) -> bool:
+        """Whether nothing has moved for a while, and nothing is touched."""
+        return self.machine.rests and self.runtime_state is not RuntimeState.STOPPING
+
     def write_inputs(self, values: Mapping[str, InputValue]) -> None:
         """Take one package of RTDE inputs, by name.
 

@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import float64, njit
+from numba.types import UniTuple
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Turn, Vector, cross, rotated, rotated_back
@@ -15,6 +17,7 @@ from tactile_resonance.simulation.ur5e.poses import ORIGIN, ZERO, Six, Transform
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
 
 STANDARD_GRAVITY_M_S2 = 9.80665
+_6 = UniTuple(float64, 6)
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ class FtSensor:
     """
 
     def __init__(self, specification: FtSpecification, random: np.random.Generator) -> None:
-        self._offset = (specification.accuracy / 2 * random.standard_normal(6)).tolist()
+        self._offset = specification.accuracy / 2 * random.standard_normal(6)
         sigma = specification.precision / 2
         self._noise = (sigma * np.sqrt(1 - specification.drift_share)).tolist()
         self._drift_rms = sigma * np.sqrt(specification.drift_share)
@@ -103,7 +106,7 @@ class FtSensor:
 
     def reseed(self, random: np.random.Generator) -> None:
         """Take all noise from the next step on from a generator, drift drawn anew; the offset stays."""
-        self._drift: list[float] = (self._drift_rms * random.standard_normal(6)).tolist()
+        self._drift = self._drift_rms * random.standard_normal(6)
         self._rows = NormalRows(random, [*self._kick, *self._noise])
 
     def step(self, true: Six, payload_weight: Six, external: Six | None = None) -> None:
@@ -118,12 +121,7 @@ class FtSensor:
         external : 6 floats, optional
             Measured by another sensor, to be used in place of this one's reading.
         """
-        noise, keep = self._rows.take(), self._keep
-        self._drift = [
-            keep * drift + kick for drift, kick in zip(self._drift, noise[:6], strict=True)
-        ]
-        parts = zip(true, self._offset, self._drift, noise[6:], strict=True)
-        self.raw = tuple([t + offset + drift + n for t, offset, drift, n in parts])
+        self.raw = _read(self._drift, self._offset, self._rows.take(), true, self._keep)
         self._free = difference(self.raw if external is None else external, payload_weight)
 
     def zero(self) -> None:
@@ -140,10 +138,41 @@ class FtSensor:
         tcp_m : Vector
             Place of the TCP in the flange.
         """
-        fx, fy, fz, mx, my, mz = difference(self._free, self._zero)
-        force = (fx, fy, fz)
-        x, y, z = cross(force, tcp_m)
-        return *rotated(flange, force), *rotated(flange, (mx + x, my + y, mz + z))
+        return _at_tcp(self._free, self._zero, flange, tcp_m)
+
+
+@njit(_6(float64[::1], float64[::1], UniTuple(float64, 12), _6, float64), cache=True)
+def _read(drift, offset, noise, true, keep):
+    """Let the drift go on for a cycle, and return what the sensor reads."""
+    for k in range(6):
+        drift[k] = keep * drift[k] + noise[k]
+    return (
+        true[0] + offset[0] + drift[0] + noise[6],
+        true[1] + offset[1] + drift[1] + noise[7],
+        true[2] + offset[2] + drift[2] + noise[8],
+        true[3] + offset[3] + drift[3] + noise[9],
+        true[4] + offset[4] + drift[4] + noise[10],
+        true[5] + offset[5] + drift[5] + noise[11],
+    )
+
+
+@njit(_6(_6, _6, UniTuple(float64, 9), UniTuple(float64, 3)), cache=True)
+def _at_tcp(free, zero, flange, tcp_m):
+    """See `FtSensor.at_tcp`."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = flange
+    fx, fy, fz = free[0] - zero[0], free[1] - zero[1], free[2] - zero[2]
+    (x, y, z), (mx, my, mz) = tcp_m, free[3:]
+    mx = mx - zero[3] + (fy * z - fz * y)
+    my = my - zero[4] + (fz * x - fx * z)
+    mz = mz - zero[5] + (fx * y - fy * x)
+    return (
+        xx * fx + xy * fy + xz * fz,
+        yx * fx + yy * fy + yz * fz,
+        zx * fx + zy * fy + zz * fz,
+        xx * mx + xy * my + xz * mz,
+        yx * mx + yy * my + yz * mz,
+        zx * mx + zy * my + zz * mz,
+    )
 
 
 # Speed per missing force or torque at a gain scaling of 1 [m/s/N, rad/s/(N m)], and the time constant

@@ -7,12 +7,18 @@ millimetre away from these nominal figures.
 
 Axes 2, 3 and 4 are parallel, so that joints 2 to 4 move the wrist in the plane of x and z of frame 1
 ("outwards" and "up") as an arm of two links; axes 5 and 6 meet in the wrist's centre.
+
+A simulated robot does this several times a cycle, so it is compiled (numba, which looks at the date of this
+file alone: whatever is compiled for it is in here).
 """
 
 from __future__ import annotations
 
 import math
 from itertools import product as combinations
+
+from numba import float64, njit
+from numba.types import UniTuple
 
 from tactile_resonance.contact.vectors import Vector, cross
 from tactile_resonance.simulation.ur5e.poses import IDENTITY, Six, Transform, product
@@ -22,6 +28,88 @@ D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
 
 # By how much a cosine may pass 1 from rounding alone: a joint at the edge of its reach.
 _EDGE = 1e-9
+
+_3, _6, _9, _12 = (UniTuple(float64, n) for n in (3, 6, 9, 12))
+
+
+@njit(UniTuple(float64, 24)(_6), cache=True)
+def _posture(q):
+    """Return the flange in the base, turn (9) and place (3), and the numbers (12) of `Posture`."""
+    q1, q2, q3, q4, q5, q6 = q
+    q23 = q2 + q3
+    q234 = q23 + q4
+    s1, c1 = math.sin(q1), math.cos(q1)
+    s234, c234 = math.sin(q234), math.cos(q234)
+    s5, c5 = math.sin(q5), math.cos(q5)
+    s6, c6 = math.sin(q6), math.cos(q6)
+    # ends of links 2 and 3, and the wrist's centre: outwards and up from axis 2
+    r2, h2 = A2 * math.cos(q2), A2 * math.sin(q2)
+    r3, h3 = r2 + A3 * math.cos(q23), h2 + A3 * math.sin(q23)
+    r4, h4 = r3 + D5 * s234, h3 - D5 * c234
+    wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
+    # axes of frames 4 and 5; y of frame 4 is axis 2: (s1, -c1, 0)
+    z4x, z4y, z4z = s234 * c1, s234 * s1, -c234
+    x4x, x4y, x4z = c234 * c1, c234 * s1, s234
+    x5x, x5y, x5z = c5 * x4x + s5 * s1, c5 * x4y - s5 * c1, c5 * x4z
+    z5x, z5y, z5z = c5 * s1 - s5 * x4x, -c5 * c1 - s5 * x4y, -s5 * x4z
+    return (
+        c6 * x5x - s6 * z4x, -s6 * x5x - c6 * z4x, z5x,
+        c6 * x5y - s6 * z4y, -s6 * x5y - c6 * z4y, z5y,
+        c6 * x5z - s6 * z4z, -s6 * x5z - c6 * z4z, z5z,
+        wx + D6 * z5x, wy + D6 * z5y, wz + D6 * z5z,
+        s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4,
+    )  # fmt: skip
+
+
+@njit(_6(_12, _3, _6), cache=True)
+def _twist(numbers, point_m, qd):
+    """See `Posture.twist`."""
+    s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = numbers
+    qd1, qd2, qd3, qd4, qd5, qd6 = qd
+    bending = qd2 + qd3 + qd4
+    outwards = bending * (h3 - h4) - qd2 * h3 - qd3 * (h3 - h2)
+    up = bending * (r4 - r3) + qd2 * r3 + qd3 * (r3 - r2)
+    # angular velocity along x of frame 4 and along axis 2
+    along, across = -s5 * qd6, bending + c5 * qd6
+    ox = c1 * (c234 * along + s234 * qd5) + s1 * across
+    oy = s1 * (c234 * along + s234 * qd5) - c1 * across
+    oz = s234 * along - c234 * qd5 + qd1
+    wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
+    x, y, z = point_m[0] - wx, point_m[1] - wy, point_m[2] - wz
+    return (
+        oy * z - oz * y + outwards * c1 - qd1 * wy,
+        oz * x - ox * z + outwards * s1 + qd1 * wx,
+        ox * y - oy * x + up,
+        *(ox, oy, oz),
+    )
+
+
+@njit(_6(_12, _3, _6), cache=True)
+def _speeds(numbers, point_m, twist):
+    """See `Posture.speeds`; not finite at a singularity."""
+    s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = numbers
+    vx, vy, vz, ox, oy, oz = twist
+    # A2 A3 sin(q3): 0 where the elbow is stretched; r4: where the wrist is above the shoulder
+    elbow = r2 * h3 - h2 * r3
+    if s5 == 0.0 or r4 == 0.0 or elbow == 0.0:
+        nan = math.nan
+        return nan, nan, nan, nan, nan, nan
+    wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
+    px, py, pz = wx - point_m[0], wy - point_m[1], wz - point_m[2]
+    # velocity of the wrist's centre
+    x, y, z = oy * pz - oz * py + vx, oz * px - ox * pz + vy, ox * py - oy * px + vz
+    qd1 = (c1 * y - s1 * x) / r4
+    outwards = c1 * x + s1 * y - qd1 * D4
+    oz -= qd1
+    level = c1 * ox + s1 * oy
+    qd5 = s234 * level - c234 * oz
+    qd6 = -(c234 * level + s234 * oz) / s5
+    bending = s1 * ox - c1 * oy - c5 * qd6
+    outwards -= bending * (h3 - h4)
+    up = z - bending * (r4 - r3)
+    qd2 = (outwards * (r3 - r2) + up * (h3 - h2)) / elbow
+    qd3 = -(outwards * r3 + up * h3) / elbow
+    return qd1, qd2, qd3, bending - qd2 - qd3, qd5, qd6
 
 
 class Posture:
@@ -39,32 +127,9 @@ class Posture:
 
     def __init__(self, q: Six) -> None:
         self.q = q
-        q1, q2, q3, q4, q5, q6 = q
-        q23 = q2 + q3
-        q234 = q23 + q4
-        s1, c1 = math.sin(q1), math.cos(q1)
-        s234, c234 = math.sin(q234), math.cos(q234)
-        s5, c5 = math.sin(q5), math.cos(q5)
-        s6, c6 = math.sin(q6), math.cos(q6)
-        # ends of links 2 and 3, and the wrist's centre: outwards and up from axis 2
-        r2, h2 = A2 * math.cos(q2), A2 * math.sin(q2)
-        r3, h3 = r2 + A3 * math.cos(q23), h2 + A3 * math.sin(q23)
-        r4, h4 = r3 + D5 * s234, h3 - D5 * c234
-        wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
-        # axes of frames 4 and 5; y of frame 4 is axis 2: (s1, -c1, 0)
-        z4x, z4y, z4z = s234 * c1, s234 * s1, -c234
-        x4x, x4y, x4z = c234 * c1, c234 * s1, s234
-        x5x, x5y, x5z = c5 * x4x + s5 * s1, c5 * x4y - s5 * c1, c5 * x4z
-        z5x, z5y, z5z = c5 * s1 - s5 * x4x, -c5 * c1 - s5 * x4y, -s5 * x4z
-        self.flange: Transform = (
-            (
-                c6 * x5x - s6 * z4x, -s6 * x5x - c6 * z4x, z5x,
-                c6 * x5y - s6 * z4y, -s6 * x5y - c6 * z4y, z5y,
-                c6 * x5z - s6 * z4z, -s6 * x5z - c6 * z4z, z5z,
-            ),
-            (wx + D6 * z5x, wy + D6 * z5y, wz + D6 * z5z),
-        )  # fmt: skip
-        self._numbers = s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4
+        numbers = _posture(q)
+        self.flange: Transform = numbers[:9], numbers[9:12]
+        self._numbers = numbers[12:]
         self._tools: dict[Transform, Transform] = {IDENTITY: self.flange}
 
     def tool(self, tcp: Transform) -> Transform:
@@ -84,43 +149,12 @@ class Posture:
         qd : 6 floats
             Speeds of the joints [rad/s].
         """
-        s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = self._numbers
-        qd1, qd2, qd3, qd4, qd5, qd6 = qd
-        bending = qd2 + qd3 + qd4
-        outwards = bending * (h3 - h4) - qd2 * h3 - qd3 * (h3 - h2)
-        up = bending * (r4 - r3) + qd2 * r3 + qd3 * (r3 - r2)
-        # angular velocity along x of frame 4 and along axis 2
-        along, across = -s5 * qd6, bending + c5 * qd6
-        ox = c1 * (c234 * along + s234 * qd5) + s1 * across
-        oy = s1 * (c234 * along + s234 * qd5) - c1 * across
-        oz = s234 * along - c234 * qd5 + qd1
-        wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
-        x, y, z = cross((ox, oy, oz), (point_m[0] - wx, point_m[1] - wy, point_m[2] - wz))
-        return x + outwards * c1 - qd1 * wy, y + outwards * s1 + qd1 * wx, z + up, ox, oy, oz
+        return _twist(self._numbers, point_m, qd)
 
     def speeds(self, point_m: Vector, twist: Six) -> Six | None:
         """Return the joint speeds [rad/s] of a twist, the inverse of `twist`; None at a singularity."""
-        s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = self._numbers
-        vx, vy, vz, ox, oy, oz = twist
-        # A2 A3 sin(q3): 0 where the elbow is stretched; r4: where the wrist is above the shoulder
-        elbow = r2 * h3 - h2 * r3
-        if s5 == 0.0 or r4 == 0.0 or elbow == 0.0:
-            return None
-        wx, wy, wz = r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4
-        x, y, z = cross((ox, oy, oz), (wx - point_m[0], wy - point_m[1], wz - point_m[2]))
-        x, y, z = x + vx, y + vy, z + vz  # velocity of the wrist's centre
-        qd1 = (c1 * y - s1 * x) / r4
-        outwards = c1 * x + s1 * y - qd1 * D4
-        oz -= qd1
-        level = c1 * ox + s1 * oy
-        qd5 = s234 * level - c234 * oz
-        qd6 = -(c234 * level + s234 * oz) / s5
-        bending = s1 * ox - c1 * oy - c5 * qd6
-        outwards -= bending * (h3 - h4)
-        up = z - bending * (r4 - r3)
-        qd2 = (outwards * (r3 - r2) + up * (h3 - h2)) / elbow
-        qd3 = -(outwards * r3 + up * h3) / elbow
-        return qd1, qd2, qd3, bending - qd2 - qd3, qd5, qd6
+        speeds = _speeds(self._numbers, point_m, twist)
+        return speeds if math.isfinite(sum(speeds)) else None
 
     def torques(self, point_m: Vector, wrench: Six) -> Six:
         """Return the torques [N m] of the joints that a wrench [N, N m] at a point in the base exerts."""
@@ -166,6 +200,86 @@ class Posture:
         )
 
 
+@njit
+def _cosine(numerator, denominator):
+    """Return a ratio as a cosine, clipped where rounding alone passes 1; NaN out of reach."""
+    if abs(numerator) > abs(denominator) * (1 + _EDGE) or denominator == 0.0:
+        return math.nan
+    return max(-1.0, min(1.0, numerator / denominator))
+
+
+@njit
+def _within_a_turn(angle):
+    """Return an angle in [-pi, pi], whole turns taken off."""
+    return angle - math.tau * math.floor(angle / math.tau + 0.5)
+
+
+@njit(_6(_9, _3, float64, float64, float64, float64), cache=True)
+def _solution(turn, place_m, shoulder, wrist, elbow, wrist_angle_rad):
+    """Return the joint angles for a place of the flange with given signs, each in [-pi, pi]; NaN out of reach.
+
+    Closed form: joint 1 from the wrist's centre, joints 5 and 6 from the flange's attitude, then a
+    planar arm of two links (joints 2, 3) and the angle left for joint 4.
+    """
+    xx, yx, zx, xy, yy, zy, xz, yz, zz = turn
+    px, py, pz = place_m
+    # centre of the wrist, on joint 6's axis, D6 before the flange
+    wx, wy, wz = px - D6 * zx, py - D6 * zy, pz - D6 * zz
+    sideways = _cosine(D4, math.sqrt(wx * wx + wy * wy))
+    q1 = math.atan2(wy, wx) + shoulder * math.acos(sideways) + math.pi / 2
+    s1, c1 = math.sin(q1), math.cos(q1)
+    bend = _cosine(px * s1 - py * c1 - D4, D6)
+    # flange's x and y against axis 2; both vanish where axes 4 and 6 are parallel
+    along_x, along_y = xx * s1 - xy * c1, yx * s1 - yy * c1
+    # the arc cosine alone would lose half of the digits near 0 and half a turn
+    q5 = wrist * math.atan2(math.sqrt(along_x * along_x + along_y * along_y), bend)
+    s5, c5 = math.sin(q5), math.cos(q5)
+    q6 = wrist_angle_rad if abs(s5) < _EDGE else math.atan2(-along_y / s5, along_x / s5)
+    s6, c6 = math.sin(q6), math.cos(q6)
+    # z and x axes of link 4 in the base
+    z4x, z4y, z4z = -s6 * xx - c6 * yx, -s6 * xy - c6 * yy, -s6 * xz - c6 * yz
+    fx, fy, fz = c5 * c6, -c5 * s6, -s5
+    x4x, x4y = fx * xx + fy * yx + fz * zx, fx * xy + fy * yy + fz * zy
+    x4z = fx * xz + fy * yz + fz * zz
+    q234 = math.atan2(x4z, x4x * c1 + x4y * s1)
+    # end of the two-link arm in the plane of x1 and the vertical
+    reach = (wx - D5 * z4x) * c1 + (wy - D5 * z4y) * s1
+    height = wz - D5 * z4z - D1
+    stretch = _cosine(reach * reach + height * height - A2 * A2 - A3 * A3, 2 * A2 * A3)
+    q3 = elbow * math.acos(stretch)
+    q2 = math.atan2(height, reach) - math.atan2(A3 * math.sin(q3), A2 + A3 * math.cos(q3))
+    q4 = _within_a_turn(q234 - q2 - q3)
+    return _within_a_turn(q1), _within_a_turn(q2), q3, q4, q5, _within_a_turn(q6)
+
+
+@njit
+def _closest(angle, wanted, joint_range_rad):
+    """Return an angle with the whole turns added that bring it close to another."""
+    closest = wanted + _within_a_turn(angle - wanted)
+    if abs(closest) > joint_range_rad:
+        closest -= math.copysign(math.tau, closest)
+    return closest
+
+
+@njit(UniTuple(float64, 7)(_9, _3, _6, float64), cache=True)
+def _nearest(turn, place_m, near, joint_range_rad):
+    """Return of all solutions, with whole turns added, that nearest to given angles; last how far it is."""
+    best = (near[0], near[1], near[2], near[3], near[4], near[5], math.inf)
+    for number in range(8):
+        shoulder = -1.0 if number & 4 else 1.0
+        wrist = -1.0 if number & 2 else 1.0
+        elbow = -1.0 if number & 1 else 1.0
+        q = _solution(turn, place_m, shoulder, wrist, elbow, near[5])
+        a, b = _closest(q[0], near[0], joint_range_rad), _closest(q[1], near[1], joint_range_rad)
+        c, d = _closest(q[2], near[2], joint_range_rad), _closest(q[3], near[3], joint_range_rad)
+        e, f = _closest(q[4], near[4], joint_range_rad), _closest(q[5], near[5], joint_range_rad)
+        way = abs(a - near[0]) + abs(b - near[1]) + abs(c - near[2])
+        way = way + abs(d - near[3]) + abs(e - near[4]) + abs(f - near[5])
+        if way < best[6]:
+            best = (a, b, c, d, e, f, way)
+    return best
+
+
 def inverse(flange: Transform, wrist_angle_rad: float = 0.0) -> list[Six]:
     """Return every set of joint angles that brings the flange to a place, each in [-pi, pi].
 
@@ -181,11 +295,9 @@ def inverse(flange: Transform, wrist_angle_rad: float = 0.0) -> list[Six]:
     list of 6-tuples
         At most eight; empty out of reach.
     """
-    solutions = (
-        _solution(flange, shoulder, wrist, elbow, wrist_angle_rad)
-        for shoulder, wrist, elbow in combinations((1.0, -1.0), repeat=3)
-    )
-    return [joints for joints in solutions if joints is not None]
+    signs = combinations((1.0, -1.0), repeat=3)
+    solutions = [_solution(*flange, *each, wrist_angle_rad) for each in signs]
+    return [joints for joints in solutions if math.isfinite(sum(joints))]
 
 
 def nearest_inverse(flange: Transform, near: Six, joint_range_rad: float = math.tau) -> Six | None:
@@ -205,90 +317,5 @@ def nearest_inverse(flange: Transform, near: Six, joint_range_rad: float = math.
     6 floats or None
         None where the place is out of reach.
     """
-    turn, (x, y, _) = flange
-    wx, wy = x - D6 * turn[2], y - D6 * turn[5]
-    sideways = _cosine(D4, math.hypot(wx, wy))
-    if sideways is None:
-        return None
-    outwards = wx * math.cos(near[0]) + wy * math.sin(near[0])
-    fifth, third = math.remainder(near[4], math.tau), math.remainder(near[2], math.tau)
-    signs = math.copysign(1.0, -outwards), math.copysign(1.0, fifth), math.copysign(1.0, third)
-    solution = _solution(flange, *signs, near[5])
-    if solution is not None:
-        joints, way = _closest(solution, near, joint_range_rad)
-        third, fifth = abs(solution[2]), abs(solution[4])
-        # Others bend shoulder, elbow or wrist the other way, by as much: joint 1, 3 or 5 of theirs
-        # is twice one of these angles away. Nearer than half of that this one is the nearest.
-        if way < min(math.acos(sideways), third, math.pi - third, fifth, math.pi - fifth):
-            return joints
-    found = [_closest(each, near, joint_range_rad) for each in inverse(flange, near[5])]
-    return min(found, key=lambda each: each[1])[0] if found else None
-
-
-def _solution(
-    flange: Transform, shoulder: float, wrist: float, elbow: float, wrist_angle_rad: float
-) -> Six | None:
-    """Return the joint angles for a place of the flange with given signs, each in [-pi, pi].
-
-    Closed form: joint 1 from the wrist's centre, joints 5 and 6 from the flange's attitude, then a
-    planar arm of two links (joints 2, 3) and the angle left for joint 4.
-    """
-    (xx, yx, zx, xy, yy, zy, xz, yz, zz), (px, py, pz) = flange
-    # centre of the wrist, on joint 6's axis, D6 before the flange
-    wx, wy, wz = px - D6 * zx, py - D6 * zy, pz - D6 * zz
-    sideways = _cosine(D4, math.hypot(wx, wy))
-    if sideways is None:
-        return None
-    q1 = math.atan2(wy, wx) + shoulder * math.acos(sideways) + math.pi / 2
-    s1, c1 = math.sin(q1), math.cos(q1)
-    bend = _cosine(px * s1 - py * c1 - D4, D6)
-    if bend is None:
-        return None
-    # flange's x and y against axis 2; both vanish where axes 4 and 6 are parallel
-    along_x, along_y = xx * s1 - xy * c1, yx * s1 - yy * c1
-    # the arc cosine alone would lose half of the digits near 0 and half a turn
-    q5 = wrist * math.atan2(math.hypot(along_x, along_y), bend)
-    s5, c5 = math.sin(q5), math.cos(q5)
-    q6 = wrist_angle_rad if abs(s5) < _EDGE else math.atan2(-along_y / s5, along_x / s5)
-    s6, c6 = math.sin(q6), math.cos(q6)
-    # z and x axes of link 4 in the base
-    z4x, z4y, z4z = -s6 * xx - c6 * yx, -s6 * xy - c6 * yy, -s6 * xz - c6 * yz
-    fx, fy, fz = c5 * c6, -c5 * s6, -s5
-    x4x, x4y = fx * xx + fy * yx + fz * zx, fx * xy + fy * yy + fz * zy
-    x4z = fx * xz + fy * yz + fz * zz
-    q234 = math.atan2(x4z, x4x * c1 + x4y * s1)
-    # end of the two-link arm in the plane of x1 and the vertical
-    reach = (wx - D5 * z4x) * c1 + (wy - D5 * z4y) * s1
-    height = wz - D5 * z4z - D1
-    stretch = _cosine(reach * reach + height * height - A2 * A2 - A3 * A3, 2 * A2 * A3)
-    if stretch is None:
-        return None
-    q3 = elbow * math.acos(stretch)
-    q2 = math.atan2(height, reach) - math.atan2(A3 * math.sin(q3), A2 + A3 * math.cos(q3))
-    return (
-        math.remainder(q1, math.tau),
-        math.remainder(q2, math.tau),
-        q3,
-        math.remainder(q234 - q2 - q3, math.tau),
-        q5,
-        math.remainder(q6, math.tau),
-    )
-
-
-def _closest(solution: Six, near: Six, joint_range_rad: float) -> tuple[Six, float]:
-    """Return joint angles with whole turns added that bring them close to others, and how far they are."""
-    joints, way = [], 0.0
-    for angle, wanted in zip(solution, near, strict=True):
-        closest = wanted + math.remainder(angle - wanted, math.tau)
-        if abs(closest) > joint_range_rad:
-            closest -= math.copysign(math.tau, closest)
-        joints.append(closest)
-        way += abs(closest - wanted)
-    return tuple(joints), way
-
-
-def _cosine(numerator: float, denominator: float) -> float | None:
-    """Return a ratio as a cosine, clipped where rounding alone passes 1; None out of reach."""
-    if abs(numerator) > abs(denominator) * (1 + _EDGE) or denominator == 0.0:
-        return None
-    return max(-1.0, min(1.0, numerator / denominator))
+    *joints, way = _nearest(*flange, near, joint_range_rad)
+    return tuple(joints) if way < math.inf else None

@@ -105,6 +105,8 @@ class Joints:
 HISTORY = 500
 # Of rest before the arm counts as steady (``is_steady``, URScript manual): 0.5 s.
 STEADY_CYCLES = 250
+# The same where nothing is expected to happen soon: 1 s, longer than a client rests for its tare.
+REST_CYCLES = 500
 
 
 class Environment(Protocol):
@@ -238,6 +240,13 @@ class Machine:
     def steady(self) -> bool:
         """At rest, with no speed asked for, for half a second."""
         return self._rest_cycles >= STEADY_CYCLES
+
+    @property
+    def rests(self) -> bool:
+        """At rest for a second, and its tool touches nothing."""
+        environment = self.environment
+        free = environment is None or environment.force_n == ORIGIN == environment.torque_nm
+        return self._rest_cycles >= REST_CYCLES and free
 
     def reseed(self, random: np.random.Generator) -> None:
         """Take vibration and noise of the sensor from a generator, from the next step on."""

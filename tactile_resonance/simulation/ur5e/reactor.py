@@ -49,6 +49,7 @@ class Connection:
         self.port, self.peer_port = listener.port, int(channel.getpeername()[1])
         self._socket = channel
         self._unsent = bytearray()
+        self._gathered = bytearray()
         self._most_unsent = listener.most_unsent
         self.freezable = listener.freezable
         self.frozen = self._patient = False
@@ -77,6 +78,10 @@ class Connection:
         """
         if not self.is_open or (droppable and (self._unsent or self.frozen)):
             return False
+        if self._reactor.gathers:
+            self._gathered += data
+            self._reactor.gathered.add(self)
+            return True
         if len(self._unsent) > self._most_unsent:
             self.close()
             return False
@@ -94,6 +99,12 @@ class Connection:
             self._unsent += data[sent:]
             self._reactor.unsent.add(self)
         return True
+
+    def send_gathered(self) -> None:
+        """Send what was gathered."""
+        data = bytes(self._gathered)
+        self._gathered.clear()
+        self.send(data)
 
     @property
     def holds_data(self) -> bool:
@@ -196,18 +207,32 @@ class Reactor:
         Nothing passes the freezable ports.
     unsent : set of Connection
         Those for which data wait.
+    gathered : set of Connection
+        Those for which data were gathered.
     """
 
     def __init__(self, host: str) -> None:
         self.host = host
-        self.frozen = False
+        self.frozen = self._gathers = False
         self.unsent: set[Connection] = set()
+        self.gathered: set[Connection] = set()
         self._listeners: list[_Listener] = []
         self._connections: set[Connection] = set()
         # what is called where a descriptor can be read, and the descriptors as select takes them
         self._readers: dict[int, Callable[[], None]] = {}
         self._descriptors: list[int] = []
         self._impatient: list[int] = []
+
+    @property
+    def gathers(self) -> bool:
+        """Whether what is sent waits until this is off again, and then goes out together."""
+        return self._gathers
+
+    @gathers.setter
+    def gathers(self, value: bool) -> None:
+        self._gathers = value
+        while self.gathered and not value:
+            self.gathered.pop().send_gathered()
 
     def listen(
         self,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -15,31 +16,36 @@ REGISTER_COUNT = 48
 LARGEST_FIGURE = 1e6
 
 
+# RTDE names of the inputs, by number.
+INT_INPUTS = tuple(f"input_int_register_{n}" for n in range(REGISTER_COUNT))
+DOUBLE_INPUTS = tuple(f"input_double_register_{n}" for n in range(REGISTER_COUNT))
+_REGISTERS = frozenset({*INT_INPUTS, *DOUBLE_INPUTS})
+
+
 @dataclass
 class Registers:
     """Registers of a controller.
 
     Attributes
     ----------
-    input_int, input_double : lists of 48
-        Written by clients.
+    inputs : dict
+        Written by clients, by their RTDE names: of `INT_INPUTS` integers, of `DOUBLE_INPUTS` floats.
     output_int, output_double : lists of 48
         Written by the program.
     refreshed : set of str
         Names of inputs written since the last cycle, with whatever value: what a watchdog watches.
     """
 
-    input_int: list[int] = field(default_factory=lambda: [0] * REGISTER_COUNT)
-    input_double: list[float] = field(default_factory=lambda: [0.0] * REGISTER_COUNT)
+    inputs: dict[str, float] = field(
+        default_factory=lambda: {
+            **dict.fromkeys(INT_INPUTS, 0),
+            **dict.fromkeys(DOUBLE_INPUTS, 0.0),
+        }
+    )
     output_int: list[int] = field(default_factory=lambda: [0] * REGISTER_COUNT)
     output_double: list[float] = field(default_factory=lambda: [0.0] * REGISTER_COUNT)
     refreshed: set[str] = field(default_factory=set)
 
-
-# Place of each general purpose register among those of its kind.
-_INT_REGISTERS = {f"input_int_register_{n}": n for n in range(REGISTER_COUNT)}
-_DOUBLE_REGISTERS = {f"input_double_register_{n}": n for n in range(REGISTER_COUNT)}
-_REGISTERS = _INT_REGISTERS.keys() | _DOUBLE_REGISTERS.keys()
 
 # Types of all inputs, as the RTDE guide names them.
 INPUT_TYPES: dict[str, str] = {
@@ -56,8 +62,8 @@ INPUT_TYPES: dict[str, str] = {
     "standard_analog_output_0": "DOUBLE",
     "standard_analog_output_1": "DOUBLE",
     "external_force_torque": "VECTOR6D",
-    **dict.fromkeys(_INT_REGISTERS, "INT32"),
-    **dict.fromkeys(_DOUBLE_REGISTERS, "DOUBLE"),
+    **dict.fromkeys(INT_INPUTS, "INT32"),
+    **dict.fromkeys(DOUBLE_INPUTS, "DOUBLE"),
 }
 
 # Groups of digital outputs and their first bit in the word of all.
@@ -108,14 +114,10 @@ class Ports:
 
 def write_registers(registers: Registers, values: Mapping[str, InputValue]) -> None:
     """Write general purpose registers by their RTDE names, and note them as refreshed."""
-    for name, value in values.items():
-        if name in _DOUBLE_REGISTERS:
-            registers.input_double[_DOUBLE_REGISTERS[name]] = float(value)  # type: ignore[arg-type]
-        elif name in _INT_REGISTERS:
-            registers.input_int[_INT_REGISTERS[name]] = int(value)  # type: ignore[arg-type]
-        else:
-            continue
-        registers.refreshed.add(name)
+    if not _REGISTERS.issuperset(values):
+        values = {name: value for name, value in values.items() if name in _REGISTERS}
+    registers.inputs.update(values)  # type: ignore[arg-type]
+    registers.refreshed.update(values)
 
 
 # Steps once in a cycle, until it is done.
@@ -170,7 +172,7 @@ class Script:
 
     def integer(self, number: int) -> int:
         """Return an integer input register."""
-        return self._registers.input_int[number + self.offset]
+        return self._registers.inputs[INT_INPUTS[number + self.offset]]  # type: ignore[return-value]
 
     def double(self, number: int) -> float:
         """Return a double input register; raises as `doubles`."""
@@ -189,15 +191,14 @@ class Script:
         ScriptError
             If one of them is not finite or beyond +-1e6.
         """
-        first = number + self.offset
-        values = self._registers.input_double[first : first + count]
-        for value in values:
-            if not -LARGEST_FIGURE <= value <= LARGEST_FIGURE:
-                raise ScriptError(
-                    f"input_double_register_{first}...: {values}; accepted are numbers within "
-                    f"+-{LARGEST_FIGURE:g}"
-                )
-        return tuple(values)
+        first, inputs = number + self.offset, self._registers.inputs
+        values = tuple([inputs[name] for name in DOUBLE_INPUTS[first : first + count]])
+        if not (math.isfinite(sum(values)) and max(map(abs, values)) <= LARGEST_FIGURE):
+            raise ScriptError(
+                f"input_double_register_{first}...: {list(values)}; accepted are numbers within "
+                f"+-{LARGEST_FIGURE:g}"
+            )
+        return values
 
     def status(self, value: int) -> None:
         """Write the state of the command loop."""

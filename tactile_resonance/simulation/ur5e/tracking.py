@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import float64, njit
+from numba.types import UniTuple
 
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.noise import NormalRows, Seed
@@ -99,29 +101,26 @@ class Jitter:
         values, vectors = np.linalg.eigh(driven)
         drive = vectors * np.sqrt(np.maximum(values, 0))
         self._rms = np.array([rms, rms * w])  # of place and speed
-        self._place_by, self._speed_by = np.hstack([transition, drive]).tolist()
+        self._by = np.ascontiguousarray(np.hstack([transition, drive]))
         self.reseed(seed)
 
     def reseed(self, seed: Seed) -> None:
         """Let vibration follow from a seed, from the next step on, beginning in a state drawn anew."""
         random = np.random.default_rng(seed)
-        self._place, self._speed = (self._rms[:, None] * random.standard_normal((2, 3))).tolist()
+        self._state = self._rms[:, None] * random.standard_normal((2, 3))  # places and speeds
         self._rows = NormalRows(random, [1.0] * 6)
 
     def step(self) -> tuple[float, float, float]:
         """Advance one period; return the displacement [m]."""
-        (x, y, z), (vx, vy, vz) = self._place, self._speed
-        x1, y1, z1, x2, y2, z2 = self._rows.take()
-        a, b, c, d = self._place_by
-        self._place = (
-            a * x + b * vx + c * x1 + d * x2,
-            a * y + b * vy + c * y1 + d * y2,
-            a * z + b * vz + c * z1 + d * z2,
-        )
-        a, b, c, d = self._speed_by
-        self._speed = (
-            a * x + b * vx + c * x1 + d * x2,
-            a * y + b * vy + c * y1 + d * y2,
-            a * z + b * vz + c * z1 + d * z2,
-        )
-        return self._place
+        return _tremble(self._state, self._by, self._rows.take())
+
+
+@njit(UniTuple(float64, 3)(float64[:, ::1], float64[:, ::1], UniTuple(float64, 6)), cache=True)
+def _tremble(state, by, noise):
+    """Advance place and speed of three axes; return the place."""
+    for k in range(3):
+        place, speed, first, second = state[0, k], state[1, k], noise[k], noise[3 + k]
+        for n in range(2):
+            a, b, c, d = by[n, 0], by[n, 1], by[n, 2], by[n, 3]
+            state[n, k] = a * place + b * speed + c * first + d * second
+    return state[0, 0], state[0, 1], state[0, 2]

@@ -187,7 +187,7 @@ def test_inputs_write_what_their_masks_select():
     assert controller.outputs("standard_analog_output1") == 0.7
     with pytest.raises(KeyError, match="input_int_register_48"):
         controller.write_inputs({"input_int_register_3": 5, "input_int_register_48": 1})
-    assert controller.registers.input_int[3] == 0
+    assert controller.registers.inputs["input_int_register_3"] == 0
 
 
 def test_speed_slider_slows_a_move(make_client):
