@@ -30,7 +30,7 @@ MAY_IMPORT = {
 """By part of the package; parts that are not here may import all others."""
 OF_THE_ROBOT = ("_typing", "contact.vectors", "fields", "simulation.noise", "simulation.ur5e")
 LIBRARIES = {
-    "numba": {"poles", "mechanics"},
+    "numba": {"poles", "mechanics", "contact", "simulation"},
     "rosbags": {"scan"},
     **dict.fromkeys(("rtde_control", "rtde_receive", "can", "nidaqmx"), {"drivers"}),
     "rclpy": {"nodes", "client"},

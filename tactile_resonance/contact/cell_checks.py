@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from operator import sub
 
 import numpy as np
 
@@ -91,7 +92,7 @@ class CellChecks:
     def __init__(self, info: ForceInfo, range_nm: float, limits: CellLimits) -> None:
         self._limits = limits
         self._range_n, self._range_nm = info.range_n, range_nm
-        self._stuck_at = limits.stuck_samples or samples_until_stuck(info)
+        self._stuck_at = limits.stuck_samples or samples_until_stuck(info) or math.inf
         self.restart()
 
     def restart(self) -> None:
@@ -124,21 +125,13 @@ class CellChecks:
             Invalid, overload, stuck or jump.
         """
         self._recent.append(False)
-        x, y, z, about_x, about_y, about_z = wrench
-        if not math.isfinite(x + y + z + about_x + about_y + about_z):
+        if not math.isfinite(sum(wrench)):
             axis = next(k for k, value in enumerate(wrench) if not math.isfinite(value))
             raise ForceError(ForceFault.INVALID, f"{_AXES[axis]} is not finite: {wrench[axis]}")
-        most_n, most_nm = self._range_n, self._range_nm
-        over = overload or not (
-            -most_n <= x <= most_n
-            and -most_n <= y <= most_n
-            and -most_n <= z <= most_n
-            and -most_nm <= about_x <= most_nm
-            and -most_nm <= about_y <= most_nm
-            and -most_nm <= about_z <= most_nm
-        )
+        most_n, most_nm, force, torque = self._range_n, self._range_nm, wrench[:3], wrench[3:]
+        over = overload or max(map(abs, force)) > most_n or max(map(abs, torque)) > most_nm
         self._over = self._over + 1 if over else 0
-        if self._over >= self._limits.overload_samples:
+        if over and self._over >= self._limits.overload_samples:
             ranges = (*[most_n] * 3, *[most_nm] * 3)
             shares = [abs(value) / most for value, most in zip(wrench, ranges, strict=True)]
             axis = shares.index(max(shares))
@@ -151,9 +144,9 @@ class CellChecks:
         if last is None:
             return over
         self._equal = self._equal + 1 if wrench == last else 0
-        if self._stuck_at is not None and self._equal + 1 >= self._stuck_at:
+        if self._equal + 1 >= self._stuck_at:
             raise ForceError(ForceFault.STUCK, f"{self._equal + 1} samples are equal on all axes")
-        largest = max(abs(x - last[0]), abs(y - last[1]), abs(z - last[2]))
+        largest = max(map(abs, map(sub, force, last)))
         if largest > self._limits.jump_n and not over:
             raise ForceError(
                 ForceFault.JUMP,

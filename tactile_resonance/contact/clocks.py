@@ -78,9 +78,12 @@ class ClockTracker:
             raise ValueError(f"remote_s: {remote_s!r}, expected a finite time")
         x = y = 0.0
         if self._origin is not None:
-            x, y = self._point(remote_s, local_ns)
-            early = self._line[0] + self._line[1] * x - y
-            if remote_s < self._last_s or (self._blocks and early > STEP_S):
+            # remote time, and local minus remote time, both since the first message
+            origin_s, origin_ns = self._origin
+            x = remote_s - origin_s
+            y = (local_ns - origin_ns) * 1e-9 - x
+            offset_s, drift = self._line
+            if remote_s < self._last_s or (self._blocks and offset_s + drift * x - y > STEP_S):
                 self._clear()
                 self.restarts += 1
         if self._origin is None:
@@ -127,12 +130,6 @@ class ClockTracker:
         if remote_s == self._last_s:
             return newest_ns
         return newest_ns + round((remote_s - self._last_s) * (1 + drift) * 1e9)
-
-    def _point(self, remote_s: float, local_ns: int) -> tuple[float, float]:
-        """Remote time and local minus remote time, both since the first message [s]."""
-        assert self._origin is not None
-        x = remote_s - self._origin[0]
-        return x, (local_ns - self._origin[1]) * 1e-9 - x
 
     def _drop_before_a_pause(self) -> None:
         """When the sender stood still, its clock is behind from then on."""

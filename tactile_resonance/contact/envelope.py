@@ -204,8 +204,8 @@ def _age(age_s: float) -> str:
 
 def inside(place_m: Vector, low_m: tuple[float, ...], high_m: tuple[float, ...]) -> bool:
     """Whether a place is in a box, its walls included."""
-    x, y, z = place_m
-    return low_m[0] <= x <= high_m[0] and low_m[1] <= y <= high_m[1] and low_m[2] <= z <= high_m[2]
+    (x, y, z), (low_x, low_y, low_z), (high_x, high_y, high_z) = place_m, low_m, high_m
+    return low_x <= x <= high_x and low_y <= y <= high_y and low_z <= z <= high_z
 
 
 def is_finite(arm: ArmSample) -> bool:

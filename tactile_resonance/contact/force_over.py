@@ -36,6 +36,9 @@ LEAST_COVERAGE = 0.8
 BATCHES, LEAST_WRENCHES = 8, 32
 """For the standard deviation of the mean."""
 
+PERIODS = 20
+"""What so many periods of the loop brought is stored at once: that takes a third of the time."""
+
 SPARE = 1.1
 """A source may be faster than it states by this factor without losing the oldest wrenches."""
 
@@ -94,6 +97,8 @@ class ForceRecord:
         self._force_gap_ns = GAP_PERIODS * 1e9 / rate_hz
         self._poses = _Ring(6, math.ceil(SPARE * length_s / period_s) + 1)
         self._now_ns, self._zero_std_n = 0, 0.0
+        # of the last periods: wrenches, zero that counts for them (None: they are no forces), state of the arm
+        self._new: list[tuple[Sequence[WrenchSample], float | None, ArmSample | None]] = []
         self._lock = threading.Lock()
 
     def restart(self, zero_std_n: float = 0.0) -> None:
@@ -105,6 +110,7 @@ class ForceRecord:
             Standard deviation of the new zero along the normal [N].
         """
         with self._lock:
+            self._store()
             self._forces.clear()
             self._zero_std_n = zero_std_n
 
@@ -132,14 +138,11 @@ class ForceRecord:
             Whether these wrenches are forces of a contact: after a tare and without a fault. Others
             count as not heard.
         """
-        zero_n = bias_n[2]
         with self._lock:
             self._now_ns = time_ns
-            for sample_ns, force_n, _, overload in wrenches:
-                usable = valid and not overload
-                self._forces.append(sample_ns, force_n[2] - zero_n if usable else math.nan)
-            if arm is not None:
-                self._poses.append(arm.time_ns, *arm.position_m, *arm.rotation_rad)
+            self._new.append((wrenches, bias_n[2] if valid else None, arm))
+            if len(self._new) >= PERIODS:
+                self._store()
 
     def over(self, t0_ns: int, t1_ns: int) -> ForceOver:
         """Return what is known of the interval from `t0_ns` to `t1_ns`.
@@ -151,6 +154,7 @@ class ForceRecord:
         """
         require(t0_ns < t1_ns, "t1_ns", t1_ns, f"above t0_ns = {t0_ns}")
         with self._lock:
+            self._store()
             now_ns, oldest_ns = self._now_ns, self._forces.kept_since_ns
             zero_std_n = self._zero_std_n
             times, rows = self._forces.around(t0_ns, t1_ns)
@@ -175,6 +179,16 @@ class ForceRecord:
             spread = spread_of(time_s, rows[inside, 0], (t1_ns - t0_ns) * 1e-9)
         force_n = float(spans.mean()[0])
         return ForceOver(force_n, std_n, spread, spans.coverage, position_m, rotation_rad, "")
+
+    def _store(self) -> None:
+        """Put what has come into the rings."""
+        forces, poses = self._forces.append, self._poses.append
+        for wrenches, zero_n, arm in self._new:
+            for time_ns, force_n, _, overload in wrenches:
+                forces(time_ns, math.nan if zero_n is None or overload else force_n[2] - zero_n)
+            if arm is not None:
+                poses(arm.time_ns, *arm.position_m, *arm.rotation_rad)
+        self._new.clear()
 
     def _missing(
         self, t0_ns: int, t1_ns: int, now_ns: int, oldest_ns: int | None, coverage: float

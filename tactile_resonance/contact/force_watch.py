@@ -37,7 +37,7 @@ class ForceWatch:
     def __init__(self, stuck_samples: int, mean_s: float) -> None:
         self._stuck_samples = stuck_samples
         self._equal = 1
-        self._last: WrenchSample | None = None
+        self._last: tuple[int, float] | None = None  # time and force along z of the newest
         self._times_ns: deque[int] = deque(maxlen=RECENT)
         self._forces_n: deque[float] = deque(maxlen=RECENT)  # along z, at these times
         self._mean = RunningMean(round(mean_s * 1e9))
@@ -75,15 +75,17 @@ class ForceWatch:
             return Breach(Cause.FORCE_INVALID, f"force is not finite: {x}, {y}, {z} N")
         since_ns = 0
         if self._last is not None:
-            since_ns = time_ns - self._last.time_ns
+            last_ns, last_n = self._last
+            since_ns = time_ns - last_ns
             if since_ns <= 0:
-                text = f"time of forces does not ascend: {time_ns} after {self._last.time_ns} ns"
+                text = f"time of forces does not ascend: {time_ns} after {last_ns} ns"
                 return Breach(Cause.FORCE_INVALID, text)
-            self._equal = self._equal + 1 if z == self._last.force_n[2] else 1
-        self._last = sample
-        if self._equal >= self._stuck_samples:
-            text = f"{self._equal} equal forces in a row: the sensor is stuck"
-            return Breach(Cause.FORCE_STUCK, text)
+            self._equal = self._equal + 1 if z == last_n else 1
+            if self._equal >= self._stuck_samples:
+                self._last = time_ns, z
+                text = f"{self._equal} equal forces in a row: the sensor is stuck"
+                return Breach(Cause.FORCE_STUCK, text)
+        self._last = time_ns, z
         z -= inertia_n
         if self._bias_n is not None:
             bias_x, bias_y, bias_z = self._bias_n
@@ -101,7 +103,7 @@ class ForceWatch:
 
     def age_s(self, now_ns: int) -> float:
         """Age of the newest wrench [s]; infinite before the first."""
-        return math.inf if self._last is None else (now_ns - self._last.time_ns) * 1e-9
+        return math.inf if self._last is None else (now_ns - self._last[0]) * 1e-9
 
     @property
     def mean_n(self) -> float | None:

@@ -13,10 +13,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
-from tactile_resonance.contact.estimator import ContactFilter, hertz_depth
+from tactile_resonance.contact.estimator import hertz_depth
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.fields import require
+
+if TYPE_CHECKING:  # numba takes a while to load
+    from tactile_resonance.contact.contact_filter import ContactFilter
 
 SURE_SHARE = 0.02
 """Uncertainty of the force, as a share of it, for which no caution is needed."""

@@ -25,10 +25,6 @@ MOST_STOPS = 20
 GONE = (ArmFault.LINK_LOST, ArmFault.CLIENT_DIED)
 """With these no stop reaches the arm any more."""
 
-IDLE_PERIODS = 10
-"""While no contact is under way, only one of so many periods is run: 20 ms, half of what a robot's watchdog of
-25 Hz allows, since in simulated time it is fed once per period."""
-
 
 class Cycle(NamedTuple):
     """What one cycle saw, for those who record or publish it."""
@@ -109,14 +105,11 @@ class ContactLoop:
         self.wait()
         self.run_period()
 
-    @property
-    def demand(self) -> Demand:
-        """Whether what is under way needs simulated time to pass."""
-        return Demand.NONE if self.controller.waits else Demand.FAST
-
     def wait(self) -> None:
         """Wait for the next period; requests may be made meanwhile."""
-        self._clock.wait_until(self._next_ns, self.demand)
+        # whether what is under way needs simulated time to pass
+        waits = self._clock.simulated and self.controller.waits
+        self._clock.wait_until(self._next_ns, Demand.NONE if waits else Demand.FAST)
 
     def skip(self) -> None:
         """Leave out the period that is due; the next one begins a period from now."""
@@ -157,11 +150,12 @@ class ContactLoop:
         else:
             if self._owed is not None and now - self._owed_ns > STOP_AGAIN_NS and _rests(arm):
                 self._owed = None
-        state = self.controller.state
-        self._next_ns += period_ns * (IDLE_PERIODS if state is State.IDLE else 1)
+        controller = self.controller
+        self._next_ns += period_ns * controller.periods
         if self._listener is not None:
-            zero = self.controller.bias_n, self.controller.bias_std_n
-            self._listener(Cycle(now, arm, wrenches, state, late_ns * 1e-9, *zero, fault))
+            zero = controller.bias_n, controller.bias_std_n
+            cycle = Cycle(now, arm, wrenches, controller.state, late_ns * 1e-9, *zero, fault)
+            self._listener(cycle)
 
     def bring_to_rest(self) -> str:
         """Stop the arm until it is seen to stand, at most `MOST_STOPS` times; why it was not, else empty.

@@ -57,6 +57,13 @@ its own times the second."""
 SAME_RAD = 1e-4
 """Goals turned by less against each other are turned alike: the weight of a dish turns with the tip."""
 
+IDLE_PERIODS = 10
+"""While no contact is under way, only one of so many periods is run: 20 ms, half of what a robot's watchdog of
+25 Hz allows, since in simulated time it is fed once per period."""
+
+CALM = 2.5
+"""Deviations by which the force of a held contact that is calm is off at most, as a mean of some forces."""
+
 WISH_NS = 1_000_000_000
 """For so long a retraction that is asked for waits for an arm that cannot move [ns]."""
 
@@ -74,6 +81,9 @@ class ContactController:
         For its housing, which is not watched without it.
     under_sample : bool
         Whether the cell is under the sample.
+    calm_periods : int
+        While a contact is held on tissue that is still and brings no surprise, one of so many periods is run;
+        of a cell that moves with the tip each one is.
 
     Attributes
     ----------
@@ -90,9 +100,11 @@ class ContactController:
         tip: TipGeometry | None = None,
         *,
         under_sample: bool = False,
+        calm_periods: int = 1,
     ) -> None:
         limits.check(parameters)
         self._tip, self._under_sample = tip, under_sample
+        self._calm_periods = calm_periods if under_sample else 1
         self.parameters, self.limits = parameters, limits
         self.state = State.IDLE
         self.goal: ContactGoal | None = None
@@ -107,6 +119,7 @@ class ContactController:
         self._height_m = 0.0
         self._state_ns = 0
         self._wish_retract = self._rising = False
+        self._stride = 1
         self._wish_ns: int | None = None  # since when it waits for an arm that cannot move
 
     @property
@@ -246,6 +259,7 @@ class ContactController:
             self._rise(now_ns, arm, fault)
         if self.state is State.IDLE or goal is None:
             return None
+        self._stride = 1
         place = None
         if arm is not None and is_finite(
             arm
@@ -273,13 +287,28 @@ class ContactController:
         limit = self.parameters.acceleration_m_s2
         if self.state in RELIEVING and speed > arm_model.set_speed_m_s:
             limit = max(limit, self.parameters.relief_acceleration_m_s2)
-        arm_model.step(speed, limit)
+        if self._calm_periods > 1 and self._is_calm():
+            self._stride = self._calm_periods
+        for _ in range(self._stride):
+            arm_model.step(speed, limit)
         return Command(twist, limit)
 
     def _stop(self) -> Command:
         limit = self.limits.stop_deceleration_m_s2
         self._observer.arm_model.step(0.0, limit)
         return Command(None, limit)
+
+    @property
+    def periods(self) -> int:
+        """After so many periods the next cycle is due."""
+        return IDLE_PERIODS if self.state is State.IDLE else self._stride
+
+    def _is_calm(self) -> bool:
+        """Whether a contact is held on tissue that is still, and brings no surprise."""
+        model = self._observer.model
+        if model is None or model.moving or self.state is not State.HOLD:
+            return False
+        return abs(model.surprise) < CALM and not self._wish_retract
 
     @property
     def _free_for_goals(self) -> bool:

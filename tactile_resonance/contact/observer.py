@@ -7,7 +7,8 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-from tactile_resonance.contact.estimator import ContactFilter, TouchDetector
+from tactile_resonance.contact.contact_filter import ContactFilter
+from tactile_resonance.contact.estimator import TouchDetector
 from tactile_resonance.contact.force_watch import ForceWatch
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Breach, Cause
@@ -176,16 +177,17 @@ class Observer:
     def take(self, wrenches: Sequence[WrenchSample], arm_ns: int, height_m: float) -> Breach | None:
         """Take a state of the arm and the forces that came; stop at the first that is bad."""
         self._heights.append((arm_ns, height_m))
-        if self._carried_kg > 0:
+        carried_kg, inertia = self._carried_kg, 0.0
+        if carried_kg > 0:
             middle = arm_ns - self._half_period_ns
             self._accelerations.append((middle, self.arm_model.acceleration_m_s2))
-        watch, model = self.watch, self.model
+        watch, model, speed_m_s = self.watch, self.model, self.arm_model.speed_m_s
         for sample in wrenches:
-            time_ns, inertia = sample.time_ns, 0.0
-            if self._carried_kg > 0:
+            time_ns = sample[0]
+            if carried_kg > 0:
                 # a cell on the tool feels the contact less mass times acceleration
                 then = time_ns - self._cell_lag_ns
-                inertia = -self._carried_kg * _between(self._accelerations, then, 0.0)
+                inertia = -carried_kg * _between(self._accelerations, then, 0.0)
             breach = watch.add(sample, inertia)
             if breach is not None:
                 self.sound = False
@@ -193,12 +195,10 @@ class Observer:
             if self.taring:
                 self._unloaded.append(sample)
             elif self._detector is not None:
-                force = watch.force_n[2]
-                height = _between(self._heights, time_ns, self.arm_model.speed_m_s)
+                force, height = watch.force_n[2], _between(self._heights, time_ns, speed_m_s)
                 self._window.append((height, force))
                 if model is not None:
-                    model.predict((time_ns - self._model_ns) * 1e-9)
-                    model.update(height, force)
+                    model.follow((time_ns - self._model_ns) * 1e-9, height, force)
                     self._model_ns = time_ns
                     self._sum_n += force
                     self._count += 1
@@ -230,12 +230,12 @@ def _between(history: deque[tuple[int, float]], time_ns: int, rate_per_s: float)
     """Value at a time, linear between those known; beyond the newest it goes on at a rate."""
     after: tuple[int, float] | None = None
     for before in reversed(history):
-        if before[0] > time_ns:
+        then_ns, value = before
+        if then_ns > time_ns:
             after = before
         elif after is None:
-            late = min(LONGEST_GUESS_S, (time_ns - before[0]) * 1e-9)
-            return before[1] + rate_per_s * late
+            return value + rate_per_s * min(LONGEST_GUESS_S, (time_ns - then_ns) * 1e-9)
         else:
-            share = (time_ns - before[0]) / (after[0] - before[0])
-            return before[1] + share * (after[1] - before[1])
+            share = (time_ns - then_ns) / (after[0] - then_ns)
+            return value + share * (after[1] - value)
     return history[0][1]

@@ -12,8 +12,8 @@ from collections import deque
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.contact.contact_filter import ContactFilter
 from tactile_resonance.contact.envelope import Place
-from tactile_resonance.contact.estimator import ContactFilter
 from tactile_resonance.contact.goal import ContactGoal, Move, State, failed
 from tactile_resonance.contact.law import SURE_SHARE, HoldMode, force_speed, place_speed
 from tactile_resonance.contact.observer import Observer

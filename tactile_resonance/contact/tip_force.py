@@ -14,14 +14,13 @@ from tactile_resonance.contact.interfaces import Cell, ForceInfo, Mount
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
 from tactile_resonance.contact.vectors import (
+    NO_TURN,
     ZERO,
-    Six,
     Turn,
     Vector,
     cross,
     difference,
     rotated,
-    rotated_back,
     transposed,
     turn_from_vector,
     turn_product,
@@ -113,25 +112,32 @@ class Mounting:
         motion : Motion
             While they were measured.
         """
-        carried: Six = (*ZERO, *ZERO)
+        cfx = cfy = cfz = ctx = cty = ctz = 0.0  # what the cell carries
         if self.mount is Mount.TOOL:
             turn, lever = self._turn, self._place_m
             if self.payload is not None:
                 arm_m = rotated(motion.turn, self._centre_m)
-                carried = self.payload.wrench(
+                cfx, cfy, cfz, ctx, cty, ctz = self.payload.wrench(
                     turn_product(motion.turn, turn), motion.acceleration_of(arm_m)
                 )
         else:
-            a, b, c, d, e, f, g, h, i = turn_product(transposed(motion.turn), self._turn)
-            turn = -a, -b, -c, -d, -e, -f, -g, -h, -i  # what acts on the sample, turned round
-            lever = rotated_back(motion.turn, difference(self._place_m, motion.position_m))
-        cfx, cfy, cfz, ctx, cty, ctz = carried
+            back = transposed(motion.turn)
+            turn = back if self._turn == NO_TURN else turn_product(back, self._turn)
+            lever = rotated(back, difference(self._place_m, motion.position_m))
+        (a, b, c, d, e, f, g, h, i), (lx, ly, lz) = turn, lever
+        if self.mount is Mount.TABLE:  # what acts on the sample, turned round
+            a, b, c, d, e, f, g, h, i = -a, -b, -c, -d, -e, -f, -g, -h, -i
         felt = []
         for time_ns, (fx, fy, fz, tx, ty, tz), overload in samples:
-            force = rotated(turn, (fx - cfx, fy - cfy, fz - cfz))
-            x, y, z = rotated(turn, (tx - ctx, ty - cty, tz - ctz))
-            dx, dy, dz = cross(lever, force)
-            felt.append(WrenchSample(time_ns, force, (x + dx, y + dy, z + dz), overload))
+            # written out: this is done for every wrench
+            fx, fy, fz, tx, ty, tz = fx - cfx, fy - cfy, fz - cfz, tx - ctx, ty - cty, tz - ctz
+            x, y, z = a * fx + b * fy + c * fz, d * fx + e * fy + f * fz, g * fx + h * fy + i * fz
+            torque = (
+                a * tx + b * ty + c * tz + (ly * z - lz * y),
+                d * tx + e * ty + f * tz + (lz * x - lx * z),
+                g * tx + h * ty + i * tz + (lx * y - ly * x),
+            )
+            felt.append(WrenchSample(time_ns, (x, y, z), torque, overload))
         return felt
 
 

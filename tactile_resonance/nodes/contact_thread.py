@@ -26,6 +26,8 @@ HUNG_S = 1.0
 END_WITHIN_S = 3.0
 # Between two attempts to start a force source that has failed, by the loop's clock.
 SOURCE_AGAIN_NS = 250_000_000
+# A contact that is held and calm is looked at in one of so many periods.
+CALM_PERIODS = 2
 
 
 class _EndedError(Exception):
@@ -66,8 +68,6 @@ class ContactThread:
         listener: Callable[[Cycle], None],
         failed: Callable[[], None],
     ) -> None:
-        under_sample = force.info.mount is Mount.TABLE
-        self.controller = ContactController(parameters, limits, tip, under_sample=under_sample)
         self.error: Exception | None = None
         self.moves = ""
         self._arm, self._force, self._failed = arm, force, failed
@@ -79,6 +79,12 @@ class ContactThread:
         self._alive_s = time.monotonic()
         self._led = arm.led_clock(force.cell, self._stay)
         self.clock: Clock = self._led or arm.clock
+        self.controller = ContactController(
+            *(parameters, limits, tip),
+            under_sample=force.info.mount is Mount.TABLE,
+            # simulated time ends where a block does, and a block waits for the force at its end
+            calm_periods=1 if self.clock.simulated else CALM_PERIODS,
+        )
         self.loop = ContactLoop(arm, force, self.clock, self.controller, listener)
         self._thread = threading.Thread(target=self._run, name="contact", daemon=True)
         self._thread.start()

@@ -344,5 +344,7 @@ def test_nothing_is_added_while_another_thread_asks():
         0.01, rel=1e-12
     )
     adding.join()
+    record._forces.around = around
     # what was being added meanwhile is there now
-    assert record._forces.newest_ns == sample.time_ns
+    over = record.over(int(times[-1]), sample.time_ns)
+    assert over.force_n == pytest.approx((0.01 + 5.0) / 2, rel=1e-12)
