@@ -21,9 +21,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "compile",
         help="compile fits, contact control and the simulated robot ahead of their first use",
-        description="Compile the fits of poles and mechanical tests, the filter of contacts and what a simulated "
-        "robot steps into numba's cache, which takes about a minute and is done once per installation. 'make "
-        "setup' does it; after 'pip install' or colcon the first use does it otherwise.",
+        description="Compile the fits of poles and mechanical tests, the filter of contacts and what a "
+        "simulated robot steps into numba's cache, which takes about a minute and is done once per "
+        "installation. 'make setup' does it; after 'pip install' or colcon the first use does it otherwise.",
     )
     parser.set_defaults(run=run)
 
