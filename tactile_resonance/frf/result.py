@@ -129,6 +129,8 @@ class FRF:
     def band(self, low_hz: float, high_hz: float) -> FRF:
         """The lines from `low_hz` to `high_hz`, ends included."""
         inside = (self.frequency_hz >= low_hz) & (self.frequency_hz <= high_hz)
+        if inside.all():
+            return self
         arrays = {name: getattr(self, name) for name in PER_LINE}
         return replace(
             self, **{name: x[..., inside] for name, x in arrays.items() if x is not None}
