@@ -25,15 +25,15 @@ def test_compiling_is_announced_once_and_before_it_begins():
     """A cheap function in place of the kernels, compiled twice; what the cache holds is not announced."""
     code = """
 import numba, sys
-from tactile_resonance.poles import tables
+from tactile_resonance.poles import compiled
 
 def kernels():
     add = numba.njit(lambda x: x + 1)
     print("called", file=sys.stderr)
     add(1), add(1.0)
 
-tables._call_kernels = kernels
-tables.compiled()
+compiled.REHEARSALS[:] = [kernels]
+compiled.compiled()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     called, *said = done.stderr.splitlines()

@@ -32,9 +32,9 @@ def run(options: argparse.Namespace) -> int:
     """Compile what is not in the cache yet."""
     # only here: numba takes a second to load
     from tactile_resonance.mechanics import course
-    from tactile_resonance.poles import tables
+    from tactile_resonance.poles import compiled
 
-    missing = tables.compiled() + course.compiled() + sum(map(_compiled, STEPPED))
+    missing = compiled.compiled() + course.compiled() + sum(map(_compiled, STEPPED))
     print(f"fits: {missing} kernels compiled" if missing else "fits: compiled already")
     return 0
 

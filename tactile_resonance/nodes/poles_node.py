@@ -13,10 +13,10 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import frf_from_message, poles_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, RESULTS, run_node
+from tactile_resonance.poles.compiled import compiled
 from tactile_resonance.poles.estimator import POLES_METHODS, poles_of_bands
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import PoleBand
-from tactile_resonance.poles.tables import compiled
 from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import origin_from_message
 

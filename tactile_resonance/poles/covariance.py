@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray
+from tactile_resonance.poles.compiled import entry, rehearsal
 from tactile_resonance.poles.model import RationalModel
-from tactile_resonance.poles.result import (
-    natural_frequency_and_damping,
-    natural_frequency_and_damping_jacobian,
-)
+from tactile_resonance.poles.result import natural_frequency_and_damping
 
 # A mode this fraction of the band outside of it is still one that the lines show.
 BAND_MARGIN = 0.1
@@ -64,18 +64,69 @@ def real_rows(values: ComplexArray) -> FloatArray:
     return np.ascontiguousarray(parts.swapaxes(-1, -2))
 
 
-def f0_damping_covariance(poles_rad_s: ComplexArray, covariance: FloatArray) -> FloatArray:
-    """(..., 2, 2) covariance of (f0_hz, damping_ratio) from that of (Re, Im) of poles (...)."""
-    jacobian = natural_frequency_and_damping_jacobian(poles_rad_s)
-    return jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
+def propagated(
+    poles_rad_s: ComplexArray, sensitivity: ComplexArray, parameters: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (..., k, 2, 2) of (Re, Im) of poles (..., k), and of (f0_hz, damping_ratio).
+
+    Parameters
+    ----------
+    poles_rad_s : (..., k) complex
+    sensitivity : (..., k, p) complex
+        Derivatives of the poles by coefficients.
+    parameters : (..., n, n) float
+        Covariance of coefficients, of which the first p belong to the sensitivity.
+    """
+    shape = poles_rad_s.shape
+    points = math.prod(shape[:-1])
+    of_poles, in_f0 = _propagated(
+        poles_rad_s.reshape(points, shape[-1]),
+        sensitivity.reshape(points, *sensitivity.shape[-2:]),
+        parameters.reshape(points, *parameters.shape[-2:]),
+    )
+    return of_poles.reshape(*shape, 2, 2), in_f0.reshape(*shape, 2, 2)
+
+
+@entry
+def _propagated(poles, sensitivity, parameters):
+    points, count, p = sensitivity.shape
+    of_poles, in_f0 = np.empty((points, count, 2, 2)), np.empty((points, count, 2, 2))
+    for point in range(points):
+        for k in range(count):
+            rr = ri = ii = 0.0
+            for i in range(p):
+                to_re = to_im = 0.0
+                for j in range(p):
+                    value = sensitivity[point, k, j]
+                    to_re += parameters[point, i, j] * value.real
+                    to_im += parameters[point, i, j] * value.imag
+                value = sensitivity[point, k, i]
+                rr += value.real * to_re
+                ri += value.real * to_im
+                ii += value.imag * to_im
+            of_poles[point, k, 0, 0], of_poles[point, k, 1, 1] = rr, ii
+            of_poles[point, k, 0, 1] = of_poles[point, k, 1, 0] = ri
+            # rows of `natural_frequency_and_damping_jacobian`
+            re, im = poles[point, k].real, poles[point, k].imag
+            size = np.sqrt(re * re + im * im)
+            a, b = re / (2 * np.pi * size), im / (2 * np.pi * size)
+            c, d = -im * im / size**3, re * im / size**3
+            in_f0[point, k, 0, 0] = a * a * rr + 2 * a * b * ri + b * b * ii
+            in_f0[point, k, 1, 1] = c * c * rr + 2 * c * d * ri + d * d * ii
+            both = a * c * rr + (a * d + b * c) * ri + b * d * ii
+            in_f0[point, k, 0, 1] = in_f0[point, k, 1, 0] = both
+    return of_poles, in_f0
+
+
+@rehearsal
+def _propagate_a_little() -> None:
+    one = np.ones((1, 1))
+    _propagated(one + 0j, one[..., None] + 0j, one[..., None])
 
 
 def pole_quantities(
-    model: RationalModel,
-    band_hz: tuple[float, float],
-    parameters: FloatArray,
-    total: FloatArray | None = None,
-) -> dict[str, npt.NDArray]:
+    model: RationalModel, band_hz: tuple[float, float], parameters: FloatArray
+) -> tuple[dict[str, npt.NDArray], ComplexArray]:
     """Poles in the band and what follows from them, by the names that `PolesBatch` gives them.
 
     Parameters
@@ -85,23 +136,24 @@ def pole_quantities(
     band_hz : (low, high)
     parameters : (..., n, n) float
         Covariance of the free coefficients, those of the denominator first.
-    total : (..., n, n) float, optional
-        The total one: ``total_covariance`` follows from it.
+
+    Returns
+    -------
+    dict
+    sensitivity : (..., k, n) complex
+        Derivatives of the poles by the coefficients of the denominator.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         poles = modes_in_band(model.poles_rad_s(), band_hz)
         f0_hz, damping_ratio = natural_frequency_and_damping(poles)
         residues, sensitivity = model.residues_and_sensitivity(poles)
-        covariance = real_covariance(sensitivity, parameters)
+        of_poles, in_f0 = propagated(poles, sensitivity, parameters)
         quantities = {
             "poles_rad_s": poles,
             "f0_hz": f0_hz,
             "damping_ratio": damping_ratio,
             "residues": residues,
-            "pole_covariance": covariance,
-            "covariance": f0_damping_covariance(poles, covariance),
+            "pole_covariance": of_poles,
+            "covariance": in_f0,
         }
-        if total is not None:
-            in_poles = real_covariance(sensitivity, total)
-            quantities["total_covariance"] = f0_damping_covariance(poles, in_poles)
-    return quantities
+    return quantities, sensitivity

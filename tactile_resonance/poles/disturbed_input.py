@@ -98,7 +98,7 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch, ratio: float) -> flo
     """
     gain = np.abs(of_all.fit.response(plan.frequency_hz(plan.bins))) ** 2
     variance = np.abs(of_all.residual) ** 2 * (1 + ratio * gain)
-    curve = two_channels(variance[None], gain[None], np.ones((1, gain.size), bool))[0]
+    curve = two_channels(variance[None], gain[None])[0]
     low, high = np.argmin(gain), np.argmax(gain)
     slope = (curve[high] - curve[low]) / max(gain[high] - gain[low], np.finfo(float).tiny)
     floor = LEAST_VARIANCE * curve.mean()

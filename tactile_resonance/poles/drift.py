@@ -21,8 +21,8 @@ from numpy.polynomial import legendre
 from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.bins import BinData
-from tactile_resonance.poles.covariance import f0_damping_covariance, real_covariance
+from tactile_resonance.poles.covariance import propagated
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Linearised
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.joint_fit import ROUNDED
@@ -220,18 +220,18 @@ def _linearised(
     """
     plan, u, theta = modes.plan, modes.u, modes.theta
     directions = np.concatenate([modes.directions(row) for row in rows])
-    others, one = plan.other_bins.size, np.ones((1, 1, 1))
-    data = BinData.of(y[None, None], u[None, None], others, one, None, None, one, order=plan.order)
+    others = plan.other_bins.size
+    data = BinData.of(y[None, None], u[None, None], plan.order, others)
     if flat:
         error = Linearised.of(plan.problem, data, theta).error[:, :others]
-        variance_y, variance_u = (v[:, None] for v in rough_noise(error, data.u[0, :, :others]))
-        data = replace(data, rest=variance_y, variance_y=variance_y, variance_u=variance_u)
+        variance_y, variance_u = rough_noise(error, data.u[0][:, data.order[:others]])
+        data = data.weighted(rest=variance_y, variance_y=variance_y, variance_u=variance_u)
     else:
-        data, _, _ = with_noise(plan, data, theta[None, None])
-    costs, gradients, normals = moments(plan.problem.tables, data.arrays, theta[None, None])
+        data, _ = with_noise(plan, data, theta[None, None])
+    costs, gradients, normals = moments(plan.problem.tables, data, theta[None, None])
     cost, gradient = float(costs.sum()), gradients[0, 0]
     at = Linearised.of(plan.problem, data, theta)
-    root = 1 / np.sqrt(at.variance[0])
+    root = 1 / np.sqrt(at.variance)
     own = np.ascontiguousarray(-(at.slope[0] * root[:, None]).T).view(float)  # (n, 2 K)
     residual = np.ascontiguousarray(at.residual[0]).view(float)
     more = np.ascontiguousarray(-directions[:, plan.order] * root).view(float)
@@ -342,8 +342,7 @@ def _result(modes: DriftingModes, drift: FloatArray, at: _Step) -> Poles:
     added = at.coefficients @ covariance @ at.coefficients.T
     pole = fit.poles_rad_s
     sensitivity = fit.fit.residues_and_sensitivity(pole)[1]
-    more = real_covariance(sensitivity, added)
-    in_f0 = f0_damping_covariance(pole, more)
+    more, in_f0 = propagated(pole, sensitivity, added)
     fit = replace(
         fit,
         coefficient_covariance=fit.coefficient_covariance + added,

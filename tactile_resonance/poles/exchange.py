@@ -21,10 +21,9 @@ from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
-from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import DenseSolution, least_squares
-from tactile_resonance.poles.lacking import poles_tried
-from tactile_resonance.poles.likelihood import LEAST_LEFT
+from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
 from tactile_resonance.poles.significance import NOISE_PASSES_FOR_A_MODE
 from tactile_resonance.poles.split import coefficients_of_roots
 
@@ -190,7 +189,7 @@ def _most_lacking(
 
 def _variance(plan: LinesPlan, row: BinData) -> FloatArray:
     """(F,) of Y."""
-    return np.broadcast_to(row.variance_y[0, 0], plan.frequency_hz.shape)
+    return np.broadcast_to(row.variance_y[0], plan.frequency_hz.shape)
 
 
 def _linear_cost(plan: LinesPlan, row: BinData, poles: ComplexArray) -> float:

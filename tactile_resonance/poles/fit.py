@@ -8,7 +8,7 @@ does not converge, has many poles or a pure delay is fitted by scipy's least squ
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,8 @@ from scipy import optimize
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
-from tactile_resonance.poles.bins import BinData, Problem
-from tactile_resonance.poles.likelihood import LINEAR, LINEAR_UNWEIGHTED
+from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.tables import Problem
 
 MAX_ITERATIONS = 60
 # A step below this many standard deviations, as the residuals show them, is the last one taken.
@@ -38,88 +38,64 @@ class Solution:
     ----------
     theta : (points, M, n) float
         Coefficients [A without its last, B, C] of each record; A and B are alike in all.
-    normal : (points, M, 2, n, n) float
-        ``Re J^H J`` of undriven and of driven bins at the solution.
     cost : (points,) float
     part_cost : (points, 2) float
         Of undriven and driven bins.
     residual : (points, M, K_driven) complex
         Weighted, turned by the phase of the input.
     converged : (points,) bool
+    normal : (points, M, 2, n, n) float
+        ``Re J^H J`` of undriven and of driven bins at the solution; of several records alone.
+    marginal : (points, M, n, n) float
+        Blocks of the inverse of the normal matrix: of the coefficients that records share and those of one;
+        NaN where it is singular or not finite.
+    condition : (points,) float
+        See `likelihood.invert`.
+    leverage : (points, 2) float
+        Real coefficients that go to undriven and to driven bins.
+    noise : (points, 2) float
+        Variances of Y and U that undriven bins show; NaN where they were not asked for.
+    plain : (points,) bool
+        False where undriven bins show noise other than flat, or alike in both channels: not fitted yet.
     """
 
     theta: FloatArray
-    normal: FloatArray
     cost: FloatArray
     part_cost: FloatArray
     residual: ComplexArray
     converged: BoolArray
+    normal: FloatArray
+    marginal: FloatArray
+    condition: FloatArray
+    leverage: FloatArray
+    noise: FloatArray
+    plain: BoolArray
 
     def rows(self, which: npt.NDArray) -> Solution:
         """Some of the points."""
-        return Solution(*(getattr(self, f.name)[which] for f in fields(Solution)))
+        arrays = {f.name: getattr(self, f.name) for f in fields(Solution)}
+        return replace(self, **{name: x[which] for name, x in arrays.items() if len(x)})
 
+    def put(self, which: npt.NDArray, others: Solution) -> None:
+        """Write other solutions in place of some."""
+        for f in fields(Solution):
+            if getattr(self, f.name).size:
+                getattr(self, f.name)[which] = getattr(others, f.name)
 
-@dataclass(frozen=True, eq=False)
-class RecordsInverse:
-    """Inverses of the normal matrices of points of several records.
-
-    Attributes
-    ----------
-    shared : (points, s, s) float
-        Block of the coefficients that records share, those of A and B.
-    marginal : (points, M, n, n) float
-        Block of these and those of one record.
-    condition : (points,) float
-        See `likelihood.invert`.
-    """
-
-    shared: FloatArray
-    marginal: FloatArray
-    condition: FloatArray
-
-    @classmethod
-    def of(cls, normal: FloatArray, shared: int) -> RecordsInverse:
-        """Of normal matrices (points, M, n, n) of each record; NaN where one is singular or not finite."""
-        points, records, n, _ = normal.shape
-        own = n - shared
-        size = shared + records * own
-        whole = np.zeros((points, size, size))
-        columns = [
-            np.r_[:shared, shared + m * own : shared + (m + 1) * own] for m in range(records)
-        ]
-        for m, here in enumerate(columns):
-            whole[:, here[:, None], here] += normal[:, m]
-        inverse, condition = likelihood.invert(whole)
-        marginal = np.stack([inverse[:, here[:, None], here] for here in columns], axis=1)
-        return cls(inverse[:, :shared, :shared], marginal, condition)
-
-    def leverage(self, normal: FloatArray) -> FloatArray:
-        """(points,) real coefficients that go to the bins of normal matrices (points, M, n, n)."""
-        return np.einsum("bmij,bmji->b", self.marginal, normal)
-
-    def sandwich(self, normal: FloatArray) -> FloatArray:
+    def sandwich(self, normal: FloatArray, shared: int) -> FloatArray:
         """(points, s, s) of the shared coefficients, of gradients with covariances (points, M, n, n)."""
-        rows = self.marginal[:, :, : self.shared.shape[-1]]
+        rows = self.marginal[:, :, :shared]
         return np.einsum("bmik,bmkl,bmjl->bij", rows, normal, rows)
 
 
-def start_values(problem: Problem, data: BinData) -> FloatArray:
-    """(points, M, n) start values; NaN where the equations are singular.
-
-    By two Sanathanan-Koerner iterations.
-    """
-    theta = np.zeros((*data.y_planes.shape[:2], sum(problem.sizes)))
-    for kind in (LINEAR_UNWEIGHTED, LINEAR):
-        theta = likelihood.linear_fit(problem.tables, data.arrays, theta, kind)
-    return theta
+RULES = likelihood.Rules(MAX_ITERATIONS, STEP_TOLERANCE, ROUNDING, 0, 0, 0.0, 0.0)
 
 
 def minimise(
     problem: Problem,
     data: BinData,
     start: FloatArray | None = None,
-    max_iterations: int = MAX_ITERATIONS,
+    rules: likelihood.Rules = RULES,
 ) -> Solution:
     """Minimise the cost of each point.
 
@@ -128,42 +104,39 @@ def minimise(
     problem : Problem
     data : BinData
     start : (points, M, n) float, optional
-        `start_values` when absent.
-    max_iterations : int
+        Start values are Sanathanan-Koerner iterations' when absent.
+    rules : Rules
     """
-    begin = start_values(problem, data) if start is None else np.ascontiguousarray(start)
-    return Solution(
-        *likelihood.minimise(
-            problem.tables, data.arrays, begin, max_iterations, STEP_TOLERANCE, ROUNDING
-        )
-    )
+    begin = np.empty((0, data.records, sum(problem.sizes))) if start is None else start
+    return Solution(*likelihood.minimise(problem.tables, data, begin, rules))
 
 
-def refit_failed(problem: Problem, solution: Solution, data: BinData) -> Solution:
-    """The points that did not converge again, at full precision."""
-    failed = np.flatnonzero(~solution.converged)
-    if not failed.size:
-        return solution
-    whole = Solution(*(getattr(solution, f.name).copy() for f in fields(Solution)))
-    for k in failed:
+def refit_failed(problem: Problem, solution: Solution, data: BinData) -> None:
+    """Fit the points that did not converge again, at full precision, in place."""
+    for k in np.flatnonzero(~solution.converged & solution.plain):
         found = least_squares(problem, data.rows(slice(k, k + 1)))
         if found.converged:
-            _place(problem, found, whole, int(k))
-    return whole
+            _place(problem, found, solution, int(k))
 
 
 def _place(problem: Problem, found: DenseSolution, whole: Solution, k: int) -> None:
     records, undriven = whole.theta.shape[1], problem.undriven
     whole.converged[k] = True
     whole.theta[k] = found.theta_of(problem, records)
+    inverse, whole.condition[k] = found.inverse()
     a, b, own = problem.sizes
     shared = a + b
     for m in range(records):
         columns = np.r_[:shared, shared + m * own : shared + (m + 1) * own]
         jacobian = found.jacobian[m][..., columns]  # (K, 2, n)
+        whole.marginal[k, m] = inverse[np.ix_(columns, columns)]
         for part, here in enumerate((slice(0, undriven), slice(undriven, None))):
             rows = jacobian[here].reshape(-1, columns.size)
-            whole.normal[k, m, part] = rows.T @ rows
+            normal = rows.T @ rows
+            if records > 1:
+                whole.normal[k, m, part] = normal
+            taken = float(np.sum(whole.marginal[k, m] * normal))
+            whole.leverage[k, part] = taken + (whole.leverage[k, part] if m else 0.0)
     power = np.sum(found.residual.real**2 + found.residual.imag**2, axis=0)
     whole.part_cost[k] = power[:undriven].sum(), power[undriven:].sum()
     whole.cost[k] = whole.part_cost[k].sum()
@@ -206,6 +179,12 @@ class DenseSolution:
         out[:, a + b :] = self.theta[a + b : a + b + records * own].reshape(records, own)
         return out
 
+    def inverse(self) -> tuple[FloatArray, float]:
+        """Inverse of the normal matrix and its condition number, as `likelihood.invert` has them."""
+        jacobian = self.jacobian.reshape(-1, self.theta.size)
+        inverse, condition = likelihood.invert((jacobian.T @ jacobian)[None])
+        return inverse[0], float(condition[0])
+
     def covariance(self) -> tuple[FloatArray, float]:
         """``(J^T J)^-1`` through singular values, and the condition number with unit columns."""
         jacobian = self.jacobian.reshape(-1, self.theta.size)
@@ -228,10 +207,10 @@ class Linearised:
     ----------
     error : (M, K) complex
         Of Y.
-    variance : (M, K) float
+    variance : (K,) float
     slope : (M, K, n) complex
         Of the model by each coefficient.
-    variance_slope : (M, K, n) float
+    variance_slope : (K, n) float
     """
 
     error: ComplexArray
@@ -263,26 +242,24 @@ class Linearised:
             by_g[:, -1] = -1j * delay_phase * g
         transient = gamma @ problem.transient.T * inverse  # (M, K)
         model = transient.copy()
-        model[:, driven] += g * data.u_driven[0]
+        u_driven = data.u_driven[0]
+        model[:, driven] += g * u_driven
         slope = np.zeros((*model.shape, theta.size), complex)
-        slope[:, driven] = by_g * data.u_driven[0][..., None]
+        slope[:, driven] = by_g * u_driven[..., None]
         slope[..., :a] -= (transient * inverse)[..., None] * problem.denominator[:, :a]
         for m in range(records):
             slope[m, :, shared + m * own : shared + (m + 1) * own] = (
                 inverse[:, None] * problem.transient
             )
-        variance = np.empty(model.shape)
-        if undriven:
-            assert data.rest is not None
-            variance[:, :undriven] = data.rest[0]
-        variance[:, driven] = data.residual_variance(g[None])[0]
-        variance_slope = np.zeros(slope.shape)
-        if data.variance_u is not None:
+        variance = data.variance[0]  # (K,)
+        variance[driven] = data.residual_variance(g[None])[0]
+        variance_slope = np.zeros((variance.size, theta.size))
+        if data.variance_u.size:
             half = data.variance_u[0] * np.conj(g)
-            if data.covariance_yu is not None:
+            if data.covariance_yu.size:
                 half = half - np.conj(data.covariance_yu[0])
-            variance_slope[:, driven] = 2 * np.real(half[..., None] * by_g)
-        return cls(data.y[0] - model, variance, slope, variance_slope)
+            variance_slope[driven] = 2 * np.real(half[..., None] * by_g)
+        return cls(data.y[0][:, data.order] - model, variance, slope, variance_slope)
 
     @property
     def residual(self) -> ComplexArray:
@@ -319,7 +296,7 @@ def least_squares(
     first_size : (K,) float, optional
         ``|A|`` that start values begin from; 1 when absent.
     """
-    used = np.isfinite(_variances(problem, data)).ravel()
+    used = np.tile(np.isfinite(data.variance[0]), data.records)
 
     def at(theta: FloatArray) -> Linearised:
         return Linearised.of(problem, data, theta, delay_phase)
@@ -355,14 +332,15 @@ def least_squares(
             except (ValueError, np.linalg.LinAlgError):  # nothing finite on the way
                 pass
         last = at(theta)
-        size = np.abs(data.u_driven[0])
-        turn = np.where(size > 0, data.u_driven[0].conj() / size, 1.0)
+        u_driven = data.u_driven[0]
+        size = np.abs(u_driven)
+        turn = np.where(size > 0, u_driven.conj() / size, 1.0)
         residual = np.nan_to_num(last.residual)
         turned = residual[:, problem.undriven :] * turn
-        jacobian = np.where(np.isfinite(last.variance)[..., None, None], last.jacobian, 0.0)
+        jacobian = np.where(np.isfinite(last.variance)[:, None, None], last.jacobian, 0.0)
         if converged:
             rows = jacobian.reshape(-1, theta.size)
-            power = float(np.sum(np.abs(data.y[0]) ** 2 / _variances(problem, data)))
+            power = float(np.sum(np.abs(data.y[0][:, data.order]) ** 2 / data.variance[0]))
             converged = _at_minimum(rows, residual.view(float).ravel(), ROUNDING**2 * power)
     return DenseSolution(theta, jacobian, last.residual, turned, converged)
 
@@ -379,28 +357,20 @@ def _at_minimum(jacobian: FloatArray, residual: FloatArray, rounding: float) -> 
     return fall <= max(STEP_TOLERANCE**2 * cost / free, rounding)
 
 
-def _variances(problem: Problem, data: BinData) -> FloatArray:
-    """(M, K) of Y, of data of one point."""
-    out = np.empty((data.records, data.undriven + data.driven))
-    if data.rest is not None:
-        out[:, : problem.undriven] = data.rest[0]
-    out[:, problem.undriven :] = data.variance_y[0]
-    return out
-
-
 def linear_step(problem: Problem, data: BinData, size: FloatArray) -> FloatArray:
     """(s + M c,) least squares of ``(A Y - B U - C) / |A|`` for sizes ``|A|`` (K,): of data of one point."""
     a, b, own = problem.sizes
     records, bins = data.records, data.undriven + data.driven
     shared, undriven = a + b, problem.undriven
     design = np.zeros((records, bins, shared + records * own), complex)
-    design[..., :a] = data.y[0][..., None] * problem.denominator[:, :a]
+    y = data.y[0][:, data.order]
+    design[..., :a] = y[..., None] * problem.denominator[:, :a]
     design[:, undriven:, a:shared] = -data.u_driven[0][..., None] * problem.numerator
     for m in range(records):
         design[m, :, shared + m * own : shared + (m + 1) * own] = -problem.transient
-    scale = 1 / (np.sqrt(_variances(problem, data)) * size)
+    scale = 1 / (np.sqrt(data.variance[0]) * size)
     design *= scale[..., None]
-    target = -data.y[0] * problem.denominator[:, a] * scale
+    target = -y * problem.denominator[:, a] * scale
     rows = np.stack([design.real, design.imag]).reshape(-1, design.shape[-1])
     right = np.stack([target.real, target.imag]).ravel()
     column = np.linalg.norm(rows, axis=0)

@@ -7,8 +7,8 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.covariance import modes_in_band
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.inputs import checked_band, checked_frf, checked_spectra
 from tactile_resonance.poles.judgement import Judged, assemble
 from tactile_resonance.poles.line_tones import poles_without_tones
@@ -236,8 +236,7 @@ def _identify(
     plan = LinesPlan.on_lines(frequency_hz, structure, band_hz)
     fit = plan.fit(data)
     covariance = fit.covariance * known.information_correction[:, None, None]
-    unknown = np.full_like(covariance, np.nan)
-    total = covariance if total_known else unknown
+    total = covariance if total_known else None
     if noise is not None:
         covariance = plan.propagated(fit, data, noise)
     cost, expected = fit.cost, known.expected_cost(parameters)
@@ -247,8 +246,10 @@ def _identify(
     if not level_known.all():
         # the residuals are all there is: they hold noise, distortion and model error together
         level = fit.cost / np.maximum(lines - parameters / 2, 0.5)
+        unknown = np.full_like(covariance, np.nan)
         covariance = _where(level_known, covariance, unknown)
-        total = _where(level_known, total, fit.covariance * level[:, None, None])
+        from_residuals = fit.covariance * level[:, None, None]
+        total = _where(level_known, unknown if total is None else total, from_residuals)
         # what rounding leaves of exact data says nothing
         suspect &= level_known | (level > ROUNDED)
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))

@@ -28,18 +28,18 @@ from tactile_resonance.poles.basis import (
     default_transient_terms,
     transient_basis,
 )
-from tactile_resonance.poles.bins import BinData, Problem
 from tactile_resonance.poles.covariance import modes_in_band, pole_quantities
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint_fit import fit_records
 from tactile_resonance.poles.joint_noise import NoiseBands
 from tactile_resonance.poles.judgement import assemble
 from tactile_resonance.poles.lacking import Directions
-from tactile_resonance.poles.likelihood import invert
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, richer
+from tactile_resonance.poles.model_error import COMPARISON, richer
 from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.tables import Problem
 
 METHOD = "joint maximum likelihood of poles and transient"
 
@@ -337,14 +337,14 @@ class JointPlan:
 
         The latter (points, places, 2, 2) is that of (f0_hz, damping_ratio), of one record each.
         """
-        solution = minimise(self.problem, data, start, COMPARISON_ITERATIONS)
+        solution = minimise(self.problem, data, start, COMPARISON)
         theta = solution.theta[:, 0]
         if data.records > 1:
             return self.poles_in_band(theta), None
-        inverse, _ = invert(solution.normal[:, 0].sum(axis=1))
+        inverse = solution.marginal[:, 0]
         dof = max(data.undriven + data.driven - inverse.shape[-1] / 2, 1)
         covariance = inverse * (solution.cost / (2 * dof))[:, None, None]
-        quantities = pole_quantities(self.model_of(theta), self.band_hz, covariance)
+        quantities, _ = pole_quantities(self.model_of(theta), self.band_hz, covariance)
         return quantities["poles_rad_s"], quantities["covariance"]
 
     @property

@@ -9,19 +9,19 @@ record the cost and the smoothness of the residuals show that, and a search for 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Solution, minimise, refit_failed
-from tactile_resonance.poles.joint_noise import with_noise
+from tactile_resonance.poles.joint_noise import TINY, with_noise
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import asks, lacking_terms
 from tactile_resonance.poles.levels import Level, Levels
-from tactile_resonance.poles.likelihood import invert, moments
+from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.model_error import systematic_of
 from tactile_resonance.poles.noise_level import are_flat
 from tactile_resonance.poles.realisations_spread import Spread
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
 
-# Records that are fitted together: enough for what a call costs, few enough for the cache.
-CHUNK = 1000
 # Of the power of the data: residuals below are rounding.
 ROUNDED = 1e-22
 # How often the noise of one record is taken anew, and the change of its variance below which it is the same.
@@ -51,7 +49,7 @@ class _Round:
     ----------
     plan : JointPlan
     plain : BinData
-        Without variances.
+        As they came.
     data : BinData
         With variances, and without what came through the input.
     solution : Solution
@@ -70,6 +68,28 @@ class _Round:
     noise: FloatArray
     kind: IntArray
     share: FloatArray | None = None
+
+    @classmethod
+    def of(
+        cls,
+        plan: JointPlan,
+        plain: BinData,
+        data: BinData,
+        start: FloatArray,
+        noise: FloatArray,
+        kind: IntArray,
+        share: FloatArray | None = None,
+    ) -> _Round:
+        """The fit of weighted data from coefficients (batch, M, n) near the minimum."""
+        solution = minimise(plan.problem, data, start)
+        refit_failed(plan.problem, solution, data)
+        return cls(plan, plain, data, solution, noise, kind, share)
+
+    @classmethod
+    def weighted_with_noise(cls, plan: JointPlan, plain: BinData, theta: FloatArray) -> _Round:
+        """Weighted with the noise between harmonics that coefficients near the minimum show."""
+        data, found = with_noise(plan, plain, theta)
+        return cls.of(plan, plain, data, theta, found.mean_variances, found.kind)
 
     def rows(self, which: IntArray) -> _Round:
         """Some of the points, of a round without `share`."""
@@ -92,7 +112,7 @@ class _Round:
     @cached_property
     def variance(self) -> FloatArray:
         """(batch, K_e) of the residuals of each realisation that is weighted with."""
-        return _variance(self.data, self.response)
+        return np.broadcast_to(self.data.residual_variance(self.response), self.response.shape)
 
     @cached_property
     def pieces(self) -> Pieces:
@@ -118,10 +138,11 @@ class _Round:
         part : (batch, K_e) float
             Their variance, of that weighted with.
         """
-        variance = (self.variance / part)[:, None]
-        changed = replace(self.data, variance_y=variance, variance_u=None, covariance_yu=None)
-        tables = self.plan.problem.tables
-        return moments(tables, changed.arrays, self.solution.theta)[2][:, :, 1]
+        none = np.empty((len(part), 0))
+        changed = self.data.weighted(
+            variance_y=self.variance / part, variance_u=none, covariance_yu=none
+        )
+        return moments(self.plan.problem.tables, changed, self.solution.theta)[2][:, :, 1]
 
     def covariances(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Of the shared coefficients, from noise and in total; see `Levels.covariances`."""
@@ -147,16 +168,16 @@ def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
     far above the output's or the same in both. Where the noise then looks other than flat, or the model
     wrong, its level is taken once more, from where the fit ended.
     """
-    judged = _in_chunks(plan, u, y)
+    judged = _fit(plan, u, y)
     doubtful = np.full(len(y), _returns(plan, y.shape[1]))
     for _ in range(MOST_RETURNS):
         doubtful &= (judged.suspect | (judged.kind != 0)) & _may_return(judged)
         if not doubtful.any():
             break
-        rows, before = np.flatnonzero(doubtful), judged.noise[:, 0]
-        again = _in_chunks(plan, u[rows], y[rows], judged.theta[rows, None])
-        judged = judged.replaced(rows, again)
-        doubtful &= np.abs(judged.noise[:, 0] - before) > SAME_LEVEL * before
+        rows = np.flatnonzero(doubtful)
+        before = judged.noise[rows, 0]
+        judged.put(rows, _fit(plan, u[rows], y[rows], judged.theta[rows, None]))
+        doubtful[rows] &= np.abs(judged.noise[rows, 0] - before) > SAME_LEVEL * before
     return judged
 
 
@@ -165,51 +186,40 @@ def _returns(plan: JointPlan, records: int) -> bool:
     return records == 1 and plan.others_at.size > 0
 
 
-def _in_chunks(
+def _fit(
     plan: JointPlan, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
 ) -> Judged:
-    """Fits of all points, some at a time, from coefficients (batch, M, n) near them or start values."""
-    size = max(1, CHUNK // y.shape[1])
-    parts = []
-    for k in range(0, max(len(y), 1), size):
-        here = slice(k, k + size)
-        parts.append(_fit(plan, u[here], y[here], None if start is None else start[here]))
-    return Judged.joined(parts)
-
-
-def _fit(plan: JointPlan, u: ComplexArray, y: ComplexArray, start: FloatArray | None) -> Judged:
-    """The fit of a few points."""
-    usable = np.ones(len(y), bool)
-    if not np.isfinite(u.sum() + y.sum()):  # finite as a whole only where every bin is
-        usable = np.isfinite(u.sum(axis=(1, 2)) + y.sum(axis=(1, 2)))
-        u, y = (np.where(usable[:, None, None], v, 0) for v in (u, y))
-    one = np.ones((len(y), 1, 1))
-    others, records = plan.others_at.size, y.shape[1]
-    rest = (None, None, one) if others else (None,)
-    plain = BinData.of(y, u, others, one, *rest, order=plan.order)
-    fitted = _from_noise(plan, plain, start)
-    if records > 1:
-        return _several(fitted, usable)
-    return _alone(fitted, usable, last=start is not None or not _returns(plan, records))
-
-
-def _from_noise(plan: JointPlan, plain: BinData, start: FloatArray | None = None) -> _Round:
-    """Weighted with the noise between harmonics or, without any, as the plan says.
-
-    From coefficients (batch, M, n) near the minimum, or from start values.
-    """
+    """Fits of points, from coefficients (batch, M, n) near them or from start values."""
+    plain = BinData.of(y, u, plan.order, plan.others_at.size)
+    if start is not None:
+        return _alone(_Round.weighted_with_noise(plan, plain, start), last=True)
     if plain.undriven == 0:
         ratio = plan.input_noise_ratio or 0.0
-        data, theta = plain, start
-        if ratio:
-            data = replace(plain, variance_u=ratio * plain.variance_y)
-        noise = np.tile([1.0, ratio], (len(plain.y_planes), 1))
-        kind = np.zeros(len(noise), np.int64)
+        data = plain.weighted(variance_u=np.full((len(y), 1), ratio)) if ratio else plain
+        solution = minimise(plan.problem, data)
+        noise = np.tile([1.0, ratio], (len(y), 1))
     else:
-        data, theta, found = with_noise(plan, plain, start)
-        noise, kind = found.mean_variances, found.kind
-    solution = refit_failed(plan.problem, minimise(plan.problem, data, theta), data)
-    return _Round(plan, plain, data, solution, noise, kind)
+        solution = minimise(plan.problem, plain, None, plan.noise_bands(plain.records).rules)
+        noise = solution.noise
+        variance_y = np.where(noise[:, :1] > TINY, noise[:, :1], 1.0)
+        data = plain.weighted(rest=variance_y, variance_y=variance_y, variance_u=noise[:, 1:])
+    refit_failed(plan.problem, solution, data)
+    last = not _returns(plan, plain.records)
+    judge = _several if plain.records > 1 else partial(_alone, last=last)
+    judged = judge(_Round(plan, plain, data, solution, noise, np.zeros(len(y), np.int64)))
+    others = np.flatnonzero(~solution.plain)
+    if others.size:
+        theta = solution.theta[others]
+        judged.put(others, judge(_Round.weighted_with_noise(plan, plain.rows(others), theta)))
+    return judged
+
+
+def _usable(data: BinData, cost: FloatArray) -> BoolArray:
+    """(batch,) points whose bins are all finite."""
+    usable = np.isfinite(cost)
+    for k in np.flatnonzero(~usable):
+        usable[k] = bool(np.isfinite(data.y[k]).all() and np.isfinite(data.u[k]).all())
+    return usable
 
 
 def _may_return(fit: Judged | Solution) -> BoolArray:
@@ -218,13 +228,13 @@ def _may_return(fit: Judged | Solution) -> BoolArray:
     return np.asarray(fit.converged & finite)
 
 
-def _alone(fitted: _Round, usable: BoolArray, last: bool) -> Judged:
+def _alone(fitted: _Round, last: bool) -> Judged:
     """What a fit of one record is worth; compared with other fits where wrong, and the `last` one."""
     plan = fitted.plan
     solution, data = fitted.solution, fitted.data
-    batch, theta = usable.size, solution.theta[:, 0]
-    inverse, condition = invert(solution.normal[:, 0].sum(axis=1))
-    level = Level.of(plan, solution, inverse, fitted.noise, fitted.kind == 2)
+    theta, inverse = solution.theta[:, 0], solution.marginal[:, 0]
+    batch = len(theta)
+    level = Level.of(plan, solution, fitted.noise, fitted.kind == 2)
     residual = solution.residual[:, 0] / np.sqrt(level.scale)[:, None]
     suspect = are_smooth(residual, plan.structure.parameters) | level.suspect
     lacking = np.full((batch, 3), np.nan)
@@ -238,25 +248,25 @@ def _alone(fitted: _Round, usable: BoolArray, last: bool) -> Judged:
         suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
         rows = np.flatnonzero(suspect)
-        of_noise = (level.scale * data.variance_y.min(axis=(1, 2)))[rows]
+        of_noise = (level.scale * data.variance_y.min(axis=1))[rows]
         suspect[rows] = of_noise > ROUNDED * _mean_power(data.rows(rows))
         lacking[~suspect] = np.nan
-    wrong = suspect if last else suspect & ~_may_return(solution)  # others are fitted once more
+    # others are fitted once more
+    wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
     covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
-    unknown = np.full_like(covariance, np.nan)
     known = plan.level_known
     return Judged(
         theta=theta,
-        lines=np.where(usable, plan.excited_at.size, 0),
-        condition=condition,
+        lines=np.where(_usable(fitted.plain, solution.cost), plan.excited_at.size, 0),
+        condition=solution.condition,
         converged=solution.converged,
         residual=residual,
         cost=level.cost,
         expected=level.expected,
         suspect=suspect,
-        covariance=covariance if known else unknown,
-        total=unknown if known else covariance,
+        covariance=covariance if known else np.full_like(covariance, np.nan),
+        total=None if known else covariance,
         kind=fitted.kind,
         level_known=np.full(batch, known),
         noise=level.noise,
@@ -283,20 +293,20 @@ def _mean_power(data: BinData) -> FloatArray:
     return np.asarray(np.mean(y.real**2 + y.imag**2, axis=(1, 2)))
 
 
-def _several(first: _Round, usable: BoolArray) -> Judged:
+def _several(first: _Round) -> Judged:
     """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own."""
-    changed = _weighted_wrongly(first)
-    rest, rows = np.flatnonzero(~changed), np.flatnonzero(changed)
-    parts = []
-    if rows.size:
-        second = before = first.rows(rows)
-        for _ in range(REWEIGHTINGS):
-            second = _from_scatter(second)
-        parts.append(_judged(second, before, usable[rows]))
-    if rest.size or not rows.size:
-        part = first.rows(rest)
-        parts.append(_judged(part, part, usable[rest]))
-    return Judged.joined(parts).rows(np.argsort(np.concatenate([rows, rest])))
+    changed = np.flatnonzero(_weighted_wrongly(first) & first.solution.plain)
+    if not changed.size:
+        return _judged(first, first)
+    second = before = first.rows(changed)
+    for _ in range(REWEIGHTINGS):
+        second = _from_scatter(second)
+    again = _judged(second, before)
+    if changed.size == len(first.kind):
+        return again
+    judged = _judged(first, first)
+    judged.put(changed, again)
+    return judged
 
 
 def _weighted_wrongly(fitted: _Round) -> BoolArray:
@@ -313,11 +323,6 @@ def _weighted_wrongly(fitted: _Round) -> BoolArray:
     return changed & fitted.more_than_rounding(levels.excited)
 
 
-def _variance(data: BinData, g: ComplexArray) -> FloatArray:
-    """(batch, K_e) variance of ``y - g u`` for a response g (batch, K_e): alike in all records."""
-    return np.broadcast_to(data.residual_variance(g)[:, 0], g.shape)
-
-
 def _from_scatter(fitted: _Round) -> _Round:
     """Excited lines weighted with what realisations differ by, and fitted again."""
     plan, levels, theta, g = fitted.plan, fitted.levels, fitted.solution.theta, fitted.response
@@ -325,27 +330,23 @@ def _from_scatter(fitted: _Round) -> _Round:
     total, kind = smooth_variance(levels.line_variance * fitted.variance, gain, fitted.pieces)
     if fitted.data.undriven:
         # of distorted lines with too large weights the transients were wrong, and so the noise
-        data, _, found = with_noise(plan, fitted.plain, theta)
+        data, found = with_noise(plan, fitted.plain, theta)
         noise = found.mean_variances
-        known = _variance(data, g)
-        more = np.maximum(total - known, 0)
-        data = replace(data, variance_y=data.variance_y + more[:, None])
+        known = np.broadcast_to(data.residual_variance(g), g.shape)
+        data = data.weighted(variance_y=data.variance_y + np.maximum(total - known, 0))
         share = known / np.maximum(total, known)
     else:
         input_noise = levels.excited[:, None] * (plan.input_noise_ratio or 0.0)
         rest = np.maximum(total - input_noise * gain, 1e-3 * total)
-        data = replace(
-            fitted.plain,
-            variance_y=rest[:, None],
-            variance_u=input_noise[:, None] if plan.input_noise_ratio else None,
-        )
+        data = fitted.plain.weighted(variance_y=rest)
+        if plan.input_noise_ratio:
+            data = data.weighted(variance_u=input_noise)
         noise = np.stack([rest.mean(axis=-1), input_noise[:, 0]], axis=-1)
         share = np.ones_like(total)
-    solution = refit_failed(plan.problem, minimise(plan.problem, data, theta), data)
-    return _Round(plan, fitted.plain, data, solution, noise, kind, share)
+    return _Round.of(plan, fitted.plain, data, theta, noise, kind, share)
 
 
-def _judged(fitted: _Round, first: _Round, usable: BoolArray) -> Judged:
+def _judged(fitted: _Round, first: _Round) -> Judged:
     """What a round is worth, with what realisations differ by as systems; see `_each_by_itself`."""
     plan, solution, levels = fitted.plan, fitted.solution, fitted.levels
     batch, records, _ = solution.theta.shape
@@ -361,8 +362,8 @@ def _judged(fitted: _Round, first: _Round, usable: BoolArray) -> Judged:
         theta=np.concatenate(
             [theta[:, 0, : a + b], theta[..., a + b :].reshape(batch, records * own)], axis=1
         ),
-        lines=np.where(usable, plan.excited_at.size, 0),
-        condition=levels.inverse.condition,
+        lines=np.where(_usable(fitted.plain, solution.cost), plan.excited_at.size, 0),
+        condition=solution.condition,
         converged=solution.converged,
         residual=common,
         cost=levels.cost,
@@ -378,10 +379,10 @@ def _judged(fitted: _Round, first: _Round, usable: BoolArray) -> Judged:
         dispensable=np.zeros((batch, plan.structure.order // 2), bool),
         remark=np.full(batch, "", object),
     )
-    return _each_by_itself(judged, first)
+    return _each_by_itself(judged, total, first)
 
 
-def _each_by_itself(fit: Judged, first: _Round) -> Judged:
+def _each_by_itself(fit: Judged, total: FloatArray, first: _Round) -> Judged:
     """With the scatter of the poles of each realisation in the total covariance.
 
     Where lines are distorted the resonator is not linear. Then its poles are the mean of those of all
@@ -397,7 +398,7 @@ def _each_by_itself(fit: Judged, first: _Round) -> Judged:
     spread = Spread.of(first.plan, first.data, theta, inner, levels.excited_dof)
     distorted = levels.distorted() & spread.known
     weight = np.where(distorted, 1.0, spread.weight)
-    covariance, total = fit.covariance, fit.total
+    covariance = fit.covariance
     if distorted.any():
         of_first = first.covariances(np.zeros(weight.size, bool))
         covariance, total = (
@@ -411,7 +412,7 @@ def _each_by_itself(fit: Judged, first: _Round) -> Judged:
     for k in (0, 1):
         systematic[..., k, k] += weight[:, None] * np.maximum(np.nan_to_num(more[..., k]), 0.0)
     odd, remark = spread.remarks()
-    differing = replace(
+    return replace(
         fit,
         theta=changed,
         covariance=covariance,
@@ -420,5 +421,3 @@ def _each_by_itself(fit: Judged, first: _Round) -> Judged:
         systematic=systematic,
         remark=remark,
     )
-    rows = np.flatnonzero(weight > 0)
-    return fit.replaced(rows, differing.rows(rows))

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.covariance import pole_quantities
+from tactile_resonance.poles.covariance import pole_quantities, propagated
 from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.model_error import model_error_factor
 from tactile_resonance.poles.noise_level import KINDS
@@ -44,8 +44,8 @@ class Judged:
     covariance : (batch, p, p) float
         Of the coefficients from noise, of several records of those they share; NaN where noise cannot be
         distinguished from all else.
-    total : same shape
-        From noise and distortion; NaN where nothing but noise is known.
+    total : same shape or None
+        From noise and distortion; NaN where nothing but noise is known, None where that is so of all.
     kind : (batch,) int
         Index into `NAMES`, what the variance was taken for.
     level_known : (batch,) bool
@@ -72,7 +72,7 @@ class Judged:
     expected: FloatArray
     suspect: BoolArray
     covariance: FloatArray
-    total: FloatArray
+    total: FloatArray | None
     kind: IntArray
     level_known: BoolArray
     noise: FloatArray
@@ -81,37 +81,28 @@ class Judged:
     dispensable: BoolArray
     remark: npt.NDArray[np.object_]
 
-    def rows(self, which: IntArray) -> Judged:
-        """Some of the points."""
-        return Judged(*(getattr(self, f.name)[which] for f in fields(Judged)))
+    def put(self, rows: IntArray, others: Judged) -> None:
+        """Write other points in place of some."""
+        for f in fields(self):
+            if getattr(self, f.name) is not None:
+                getattr(self, f.name)[rows] = getattr(others, f.name)
 
-    @classmethod
-    def joined(cls, parts: list[Judged]) -> Judged:
-        """The points of several."""
-        if len(parts) == 1:
-            return parts[0]
-        names = [f.name for f in fields(cls)]
-        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
-
-    def replaced(self, rows: IntArray, others: Judged) -> Judged:
-        """With some points of another batch."""
-        if rows.size == self.lines.size:
-            return others
-        arrays = {}
-        for name in (f.name for f in fields(self)):
-            arrays[name] = getattr(self, name).copy()
-            arrays[name][rows] = getattr(others, name)
-        return Judged(**arrays)
-
-    def total_with_model_error(self) -> FloatArray:
-        """(batch, p, p) total covariance, of the suspects with the model error."""
-        if not self.suspect.any():
-            return self.total
-        rows, total = self.suspect, self.total.copy()
-        weighted = np.where(np.isfinite(total[rows]), total[rows], self.covariance[rows])
-        factor = model_error_factor(self.residual[rows], self.cost[rows], self.expected[rows])
-        total[rows] = weighted * factor[:, None, None]
-        return total
+    def total_with_model_error(self) -> tuple[IntArray, FloatArray]:
+        """Points of which more than noise is known, and their total covariances, with the model error."""
+        if self.total is None:
+            rows = np.flatnonzero(self.suspect)
+            total = self.covariance[rows]
+        else:
+            rows, total = np.arange(self.lines.size), self.total
+            if self.suspect.any():
+                known = np.isfinite(total) | ~self.suspect[:, None, None]
+                total = np.where(known, total, self.covariance)
+        if self.suspect.any():
+            wrong = self.suspect[rows]
+            args = (self.residual[rows][wrong], self.cost[rows][wrong], self.expected[rows][wrong])
+            total = total.copy()
+            total[wrong] *= model_error_factor(*args)[:, None, None]
+        return rows, total
 
 
 def assemble(
@@ -140,18 +131,23 @@ def assemble(
     # a model that the lines do not determine has no poles worth a number
     undetermined = ~(enough & conditioned)
     hopeless = undetermined | ~judged.converged
-    covariance, total = judged.covariance, judged.total_with_model_error()
+    covariance = judged.covariance
     if hopeless.any():
-        covariance, total = covariance.copy(), total.copy()
-        covariance[hopeless] = total[hopeless] = np.nan
-    quantities = pole_quantities(model, band_hz, covariance, total)
-    quantities["total_covariance"] += judged.systematic
+        covariance = covariance.copy()
+        covariance[hopeless] = np.nan
+    quantities, sensitivity = pole_quantities(model, band_hz, covariance)
+    quantities["total_covariance"] = np.full_like(quantities["covariance"], np.nan)
+    rows, total = judged.total_with_model_error()
+    if rows.size:
+        in_f0 = propagated(quantities["poles_rad_s"][rows], sensitivity[rows], total)[1]
+        in_f0[hopeless[rows]] = np.nan
+        quantities["total_covariance"][rows] = in_f0 + judged.systematic[rows]
     lost = judged.level_known & ~hopeless & _lost_to_rounding(quantities["covariance"])
     if lost.any():
         conditioned &= ~lost
         undetermined |= lost
-        covariance, total = covariance.copy(), total.copy()
-        for matrix in (covariance, total, quantities["covariance"], quantities["total_covariance"]):
+        covariance = covariance.copy()
+        for matrix in (covariance, quantities["covariance"], quantities["total_covariance"]):
             matrix[lost] = np.nan
     if undetermined.any():
         for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):

@@ -17,8 +17,8 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
-from tactile_resonance.poles.bins import BinData
-from tactile_resonance.poles.likelihood import best_fall
+from tactile_resonance.poles.compiled import entry, inner, rehearsal
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # How often each of the two tests finds something lacking in a model that is complete.
 FALSE_ALARM = 2e-4
+# Part of a direction's power that a fit must leave for it to be tried.
+LEAST_LEFT = 1e-8
 # Half widths of the modes tried: from the spacing of the lines to this part of the band. Wider ones are
 # residual terms.
 WIDEST = 1 / 8
@@ -150,21 +152,114 @@ def lacking_terms(
     """
     directions = plan.directions
     dof = data.undriven + data.driven - theta.shape[1] / 2
-    best, fall, chance = best_fall(
-        plan.problem.tables,
-        data.arrays,
-        plan.driven_bases,
-        theta,
-        inverse,
-        cost,
-        dof,
-        directions.numerator,
-        directions.modes,
-    )
+    fall = _falls(data, plan.driven_bases, theta, inverse, directions.numerator, directions.modes)
+    chance = (dof - 1) * np.log1p(-fall / cost[:, None])
+    chance[:, 1:] += np.log(max(directions.poles_rad_s.size, 1))
+    chance[np.isnan(chance)] = 0.0
+    best = np.argmin(chance, axis=1)
     found = np.full((best.size, 3), np.nan)
-    for k in np.flatnonzero(chance < np.log(FALSE_ALARM)):
-        found[k, 0] = 2 * fall[k] * (dof - 1) / (cost[k] - fall[k])
+    for k in np.flatnonzero(chance.min(axis=1) < np.log(FALSE_ALARM)):
+        least = fall[k, best[k]]
+        found[k, 0] = 2 * least * (dof - 1) / (cost[k] - least)
         found[k, 1] = 2.0 if best[k] == 0 else 4.0
         if best[k] > 0:
             found[k, 2] = np.abs(directions.poles_rad_s[best[k] - 1]) / (2 * np.pi)
     return found
+
+
+@entry
+def _falls(data, bases, theta, inverse, numerator, modes):
+    """(points, 1 + N) what costs fall by with two residual terms more, or with each of N modes.
+
+    Of fitted points (points, n) of one record, with `bases` of A, B and C on driven bins. 0 where the fit has
+    taken a direction up already.
+    """
+    basis_a, basis_b, basis_c = bases
+    points, n = theta.shape
+    bins, a, b = basis_a.shape[0], basis_a.shape[1] - 1, basis_b.shape[1]
+    own, slope, power = np.empty((n, 2, bins)), np.empty((2, bins)), np.empty(bins)
+    pair, crossed = np.empty((2, 2, bins)), np.empty((2, n))
+    falls, same_y, same_u = np.empty((points, 1 + modes.shape[0])), data.variance_y, data.variance_u
+    same_yu = data.covariance_yu
+    for point in range(points):
+        for k in range(bins):
+            place = data.order[data.undriven + k]
+            y, u = data.y[point, 0, place], data.u[point, 0, place]
+            of_a, of_b, of_c = basis_a[k, a], 0j, 0j
+            for i in range(a):
+                of_a += theta[point, i] * basis_a[k, i]
+            for i in range(b):
+                of_b += theta[point, a + i] * basis_b[k, i]
+            for i in range(n - a - b):
+                of_c += theta[point, a + b + i] * basis_c[k, i]
+            inverse_a = 1 / of_a
+            g = of_b * inverse_a
+            model = g * u + of_c * inverse_a
+            error, half = y - model, 0j  # half the derivative of the variance by g
+            variance = same_y[point, min(k, same_y.shape[1] - 1)]
+            if same_u.shape[1] > 0:
+                half += same_u[point, min(k, same_u.shape[1] - 1)] * g.conjugate()
+            if same_yu.shape[1] > 0:
+                covariance = same_yu[point, min(k, same_yu.shape[1] - 1)]
+                variance -= (covariance * g.conjugate()).real
+                half -= covariance.conjugate()
+            weight = 1 / (variance + (half * g).real)
+            # what a response more takes off half the cost
+            squared = error.real * error.real + error.imag * error.imag
+            value = weight * (error.conjugate() * u + weight * squared * half)
+            slope[0, k], slope[1, k] = value.real, value.imag
+            power[k] = weight * (u.real * u.real + u.imag * u.imag)
+            for i in range(n):
+                if i < a:
+                    value = -model * basis_a[k, i]
+                elif i < a + b:
+                    value = u * basis_b[k, i - a]
+                else:
+                    value = basis_c[k, i - a - b]
+                value *= weight * inverse_a * u.conjugate()
+                own[i, 0, k], own[i, 1, k] = value.real, value.imag
+            for r in range(2):
+                value = numerator[k, r] * inverse_a
+                pair[r, 0, k], pair[r, 1, k] = value.real, value.imag
+        falls[point, 0] = _fall(pair, own, slope, power, inverse[point], crossed)
+        for m in range(modes.shape[0]):
+            falls[point, 1 + m] = _fall(modes[m], own, slope, power, inverse[point], crossed)
+    return falls
+
+
+@inner
+def _fall(pair, own, slope, power, inverse, crossed):
+    """What the cost falls by along a pair of responses (2, 2, K), real and imaginary parts."""
+    n, bins = own.shape[0], power.size
+    p_00 = p_01 = p_11 = s_0 = s_1 = 0.0
+    for k in range(bins):
+        re_0, im_0, re_1, im_1 = pair[0, 0, k], pair[0, 1, k], pair[1, 0, k], pair[1, 1, k]
+        p_00 += power[k] * (re_0 * re_0 + im_0 * im_0)
+        p_01 += power[k] * (re_0 * re_1 + im_0 * im_1)
+        p_11 += power[k] * (re_1 * re_1 + im_1 * im_1)
+        s_0 += slope[0, k] * re_0 - slope[1, k] * im_0
+        s_1 += slope[0, k] * re_1 - slope[1, k] * im_1
+    for i in range(n):
+        c_0 = c_1 = 0.0
+        for k in range(bins):
+            c_0 += own[i, 0, k] * pair[0, 0, k] + own[i, 1, k] * pair[0, 1, k]
+            c_1 += own[i, 0, k] * pair[1, 0, k] + own[i, 1, k] * pair[1, 1, k]
+        crossed[0, i], crossed[1, i] = c_0, c_1
+    left_00, left_01, left_11 = p_00, p_01, p_11
+    for i in range(n):
+        for j in range(n):
+            left_00 -= crossed[0, i] * inverse[i, j] * crossed[0, j]
+            left_01 -= crossed[0, i] * inverse[i, j] * crossed[1, j]
+            left_11 -= crossed[1, i] * inverse[i, j] * crossed[1, j]
+    determinant = left_00 * left_11 - left_01 * left_01
+    if not determinant > LEAST_LEFT * p_00 * p_11:
+        return 0.0
+    return (left_11 * s_0 * s_0 - 2 * left_01 * s_0 * s_1 + left_00 * s_1 * s_1) / determinant
+
+
+@rehearsal
+def _search_a_little() -> None:
+    one, none = np.ones((1, 1)), np.empty((1, 0))
+    data = BinData.of(one[None], one[None])
+    bases = (np.ones((1, 2), complex), one + 0j, none + 0j)
+    _falls(data, bases, np.ones((1, 2)), np.ones((1, 2, 2)), np.ones((1, 2), complex), np.ones((1, 2, 2, 1)))

@@ -10,11 +10,11 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
-from tactile_resonance.poles.fit import RecordsInverse, Solution
+from tactile_resonance.poles.fit import Solution
 from tactile_resonance.poles.joint_noise import BINS_PER_BAND
 from tactile_resonance.poles.likelihood import invert
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
-from tactile_resonance.poles.noise_level import student_variance
+from tactile_resonance.poles.noise_level import is_rare, student_variance
 from tactile_resonance.poles.scatter import Pieces, Scatter
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ class Level:
         cls,
         plan: JointPlan,
         solution: Solution,
-        inverse: FloatArray,
         noise: FloatArray,
         by_piece: BoolArray,
     ) -> Level:
@@ -64,28 +63,26 @@ class Level:
         ----------
         plan : JointPlan
         solution : Solution
-        inverse : (batch, n, n) float
-            Of the normal matrices.
         noise : (batch, 2) float
             Mean variances of Y and U weighted with.
         by_piece : (batch,) bool
             Where the variances are from each of the pieces of the band alone.
         """
-        n, lines, others = inverse.shape[-1], plan.excited_at.size, plan.others_at.size
+        batch, _, n = solution.theta.shape
+        lines, others = plan.excited_at.size, plan.others_at.size
         if others == 0:
-            dof = np.full(len(inverse), max(lines - n / 2, 0.5))
-            scale, nothing = solution.cost / dof, np.full(len(inverse), np.nan)
-            no = np.zeros(len(inverse), bool)
+            dof = np.full(batch, max(lines - n / 2, 0.5))
+            scale, nothing = solution.cost / dof, np.full(batch, np.nan)
+            no = np.zeros(batch, bool)
             return cls(scale, nothing, nothing, no, noise * scale[:, None], student_variance(dof))
-        # leverage of the others
-        used = np.einsum("bij,bji->b", inverse, solution.normal[:, 0, 0])
+        used = solution.leverage[:, 0]
         dof_o = others - used / 2
         dof_e = lines - (n - used) / 2
         dof = dof_e + dof_o
         level = solution.part_cost[:, 0] / dof_o
         cost = solution.part_cost[:, 1] / level
         expected = dof_e * dof_o / (dof_o - 1)
-        suspect = special.fdtrc(2 * dof_e, 2 * dof_o, cost / dof_e) < MODEL_ERROR_PROBABILITY
+        suspect = is_rare(cost / dof_e, dof_e, dof_o, MODEL_ERROR_PROBABILITY)
         correction = student_variance(dof)
         if by_piece.any():
             # weights from few bins: moments of F(2, 2 nu), as in `noise_level.VarianceModel`
@@ -106,9 +103,9 @@ class Levels:
     Attributes
     ----------
     scatter : Scatter
-    inverse : RecordsInverse
-    normal : (batch, M, 2, n, n) float
-        Of undriven and driven bins.
+    solution : Solution
+    shared : int
+        Coefficients that realisations share.
     between : (batch,) float
         From the bins between harmonics: noise; NaN where there are none.
     between_dof : (batch,) float
@@ -134,8 +131,8 @@ class Levels:
     """
 
     scatter: Scatter
-    inverse: RecordsInverse
-    normal: FloatArray
+    solution: Solution
+    shared: int
     between: FloatArray
     between_dof: FloatArray
     excited: FloatArray
@@ -175,8 +172,7 @@ class Levels:
         shared = a + b
         batch, records, lines = solution.residual.shape
         scatter = Scatter.of(solution.residual, u)
-        inverse = RecordsInverse.of(solution.normal.sum(axis=2), shared)
-        used = inverse.leverage(solution.normal[:, :, 1])
+        used_between, used = solution.leverage.T
         # what the transients take from a line: of each a part 1/M of what all have in common
         taken = _taken_by_transients(plan, solution, variance)
         line_dof = (records - 1) * np.maximum(1 - taken / (2 * records), 0.05)
@@ -185,7 +181,6 @@ class Levels:
         excited = scatter.differing_cost / excited_dof
         between = between_dof = np.full(batch, np.nan)
         if plan.others_at.size > 0:
-            used_between = inverse.leverage(solution.normal[:, :, 0])
             between_dof = records * plan.others_at.size - used_between / 2
             between = solution.part_cost[:, 0] / between_dof
         cost = scatter.common_cost / excited
@@ -200,8 +195,8 @@ class Levels:
             chance = np.where(by_piece, of_pieces, chance)
         return cls(
             scatter,
-            inverse,
-            solution.normal,
+            solution,
+            shared,
             between,
             between_dof,
             excited,
@@ -260,20 +255,20 @@ class Levels:
         with np.errstate(divide="ignore", invalid="ignore"):
             nu = self.piece_dof
             pieces = np.where(nu > 2, nu / (nu - 2), 1.0)
-            last = self.normal[:, :, 1]
+            solution, shared = self.solution, self.shared
+            first, last = solution.normal[:, :, 0], solution.normal[:, :, 1]
+            noise = solution.marginal[:, 0, :shared, :shared]
             if np.isnan(self.between_dof).all():
                 both = 0.5 * (level * student_variance(dof) * pieces)[:, None, None]
-                return both * self.inverse.shared, both * self.inverse.shared
-            first = self.normal[:, :, 0]
-            noise = self.inverse.shared
+                return both * noise, both * noise
             if noise_normal is not None:
                 between = self.between
                 between_dof = self.between_dof
-                noise = self.inverse.sandwich(first + noise_normal)
+                noise = solution.sandwich(first + noise_normal, shared)
             more = level / between
             if noise_normal is None:  # there is no less than the noise
                 more = np.maximum(more, 1.0)
-            total = self.inverse.sandwich(first + last * more[:, None, None, None])
+            total = solution.sandwich(first + last * more[:, None, None, None], shared)
             scale = 0.5 * between * pieces
             total_dof = np.where(more == 1, between_dof, dof)
             return (

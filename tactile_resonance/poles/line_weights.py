@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.noise_level import VarianceModel, model_variance
 
 # Degrees of freedom that stand for a covariance known exactly.
@@ -72,7 +72,7 @@ def lines_of_frf(frf: FRF) -> WeightedLines:
         known = replace(known, independent_dof=min(frf.dof, bins))
     noise = frf.variance_noise
     return WeightedLines(
-        BinData.of(g[:, None], np.ones((len(g), 1, g.shape[1])), 0, weights[:, None]),
+        BinData.of(g[:, None], np.ones((1, 1, g.shape[1])), variance_y=weights),
         known,
         usable,
         level_known,
@@ -118,10 +118,9 @@ def lines_of_spectra(
         BinData.of(
             z[:, :1],
             z[:, 1:],
-            0,
-            np.where(usable, c_yy, np.inf)[:, None],
-            c_uu[:, None],
-            np.asarray(c_yu, complex)[:, None],
+            variance_y=np.where(usable, c_yy, np.inf),
+            variance_u=c_uu,
+            covariance_yu=c_yu,
         ),
         known,
         usable,

@@ -15,21 +15,22 @@ import numpy as np
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.basis import PolynomialBasis
-from tactile_resonance.poles.bins import BinData, Problem
 from tactile_resonance.poles.covariance import modes_in_band
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.exchange import dispensable, exchanged, moved_to
 from tactile_resonance.poles.fit import (
+    RULES,
     DenseSolution,
     Linearised,
     least_squares,
     linear_step,
     minimise,
-    start_values,
 )
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON_ITERATIONS, poorer, richer
+from tactile_resonance.poles.model_error import COMPARISON, poorer, richer
 from tactile_resonance.poles.split import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.tables import Problem
 
 # Beyond this condition number normal equations are not trusted and the Jacobian itself is
 # factorised.
@@ -37,6 +38,7 @@ NORMAL_EQUATIONS_LIMIT = 1e5
 # Models of more poles than this go to the dense solver at once.
 LARGEST_BATCHED_ORDER = 6
 REBASE_ITERATIONS = 40
+ONLY_START = RULES._replace(iterations=0)
 # Bases follow the denominator until it changes by less than this from one iteration to the next.
 REBASE_TOLERANCE = 1e-2
 
@@ -116,7 +118,7 @@ class LinesPlan:
 
     def fit(self, data: BinData) -> LinesFit:
         """Fit of all points of a batch."""
-        batch = len(data.y_planes)
+        batch = len(data.y)
         if self.structure.order > LARGEST_BATCHED_ORDER:
             return self.settled(data)._fit_dense(data)
         if self.structure.delay:
@@ -126,9 +128,9 @@ class LinesPlan:
             solution = best_of_split(
                 self.problem, data, self.model_of(solution.theta[:, 0]), solution
             )
-        inverse, condition = likelihood.invert(solution.normal[:, 0, 1])
         theta, cost, converged = solution.theta[:, 0], solution.cost, solution.converged
-        residual, parameters = solution.residual[:, 0], 0.5 * inverse
+        residual, parameters = solution.residual[:, 0], 0.5 * solution.marginal[:, 0]
+        condition = solution.condition
         doubtful = np.flatnonzero(~converged | ~(condition < NORMAL_EQUATIONS_LIMIT))
         if batch == 1 and doubtful.size:
             return self.rebased(data)._fit_dense(data)
@@ -152,7 +154,7 @@ class LinesPlan:
         if self.structure.order > LARGEST_BATCHED_ORDER or self.structure.delay:
             model = self.fit(data).model
         else:
-            theta = minimise(self.problem, data, None, COMPARISON_ITERATIONS).theta
+            theta = minimise(self.problem, data, None, COMPARISON).theta
             model = self.model_of(theta[:, 0])
         return modes_in_band(model.poles_rad_s(), self.band_hz), None
 
@@ -167,7 +169,7 @@ class LinesPlan:
         frequency domain data*, IEEE Trans. Autom. Control 50 (2005) 1835-1839). The first point
         with finite weights stands for all.
         """
-        usable = np.isfinite(data.variance_y).any(axis=(-2, -1))
+        usable = np.isfinite(data.variance_y).any(axis=-1)
         row = data.rows(slice(int(np.argmax(usable)), int(np.argmax(usable)) + 1))
         order = self.structure.order
         plan = self
@@ -191,7 +193,7 @@ class LinesPlan:
         plan = self.rebased(data)
         if self.structure.delay:
             return plan
-        usable = np.isfinite(data.variance_y).any(axis=(-2, -1))
+        usable = np.isfinite(data.variance_y).any(axis=-1)
         row = data.rows(slice(int(np.argmax(usable)), int(np.argmax(usable)) + 1))
         found = least_squares(plan.problem, row, None, None, plan.start_size)
         return exchanged(plan, row, found)[0] if np.isfinite(found.cost) else plan
@@ -213,7 +215,7 @@ class LinesPlan:
         None where weights are not finite.
         """
         y, u = row.y[0, 0], row.u[0, 0]
-        weight = 1 / (np.broadcast_to(row.variance_y[0, 0], y.shape) * size)
+        weight = 1 / (np.broadcast_to(row.variance_y[0], y.shape) * size)
         weight_y, weight_u = weight * np.abs(y) ** 2, weight * np.abs(u) ** 2
         mean_y, mean_u = weight_y.mean(), weight_u.mean()
         if not (np.isfinite([mean_y, mean_u]).all() and mean_y > 0 and mean_u > 0):
@@ -237,12 +239,13 @@ class LinesPlan:
         with np.errstate(divide="ignore", invalid="ignore"):
             finite = np.isfinite(data.variance_y)
             if fit.jacobian is None:
-                weighted = np.where(finite, data.variance_y**2 / noise[:, None], np.inf)
-                arrays = replace(data, variance_y=weighted).arrays
+                weighted = data.weighted(
+                    variance_y=np.where(finite, data.variance_y**2 / noise, np.inf)
+                )
                 theta = fit.theta[:, None]
-                normal = likelihood.moments(self.problem.tables, arrays, theta)[2][:, 0, 1]
+                normal = likelihood.moments(self.problem.tables, weighted, theta)[2][:, 0, 1]
             else:
-                ratio = np.where(finite, noise[:, None] / data.variance_y, 0.0)[:, 0]  # (batch, F)
+                ratio = np.where(finite, noise / data.variance_y, 0.0)  # (batch, F)
                 normal = np.einsum("bfpi,bf,bfpj->bij", fit.jacobian, ratio, fit.jacobian)
         inverse = 2 * fit.covariance
         return 0.5 * inverse @ normal @ inverse
@@ -267,7 +270,7 @@ class LinesPlan:
             unit_s = 1 / (2 * np.pi * float(self.frequency_hz.max()))
             phase = 2 * np.pi * self.frequency_hz * unit_s
         solutions = []
-        for k in range(data.y.shape[0]):
+        for k in range(len(data.y)):
             row = data.rows(slice(k, k + 1))
             solutions.append(self._best_of_starts(row, phase))
         theta = np.stack([s.theta for s in solutions])
@@ -326,10 +329,8 @@ def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[Floa
     step = 1.0 / max(float(np.ptp(phase)), 1e-12)
     candidates = []
     for delay in step * np.arange(-2, 13):
-        turned = BinData.of(
-            row.y * np.exp(1j * phase * delay), row.u, 0, row.variance_y, row.variance_u
-        )
-        theta = start_values(problem, turned)[0, 0]
+        turned = row._replace(y=row.y * np.exp(1j * phase * delay))
+        theta = minimise(problem, turned, None, ONLY_START).theta[0, 0]
         if not np.isfinite(theta).all():
             continue
         residual = Linearised.of(problem, turned, theta).residual

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
+from tactile_resonance.poles.compiled import entry, rehearsal
 from tactile_resonance.poles.structure import ModelStructure
 
 
@@ -120,11 +122,14 @@ class RationalModel:
         The derivatives are those by the free coefficients of A.
         """
         x = self.variable.of_s(poles_rad_s)
-        values, slopes = self.denominator_basis.at(x)
-        # A(x; a) = 0 along the root: dx = - dA / A'
-        factor = self.variable.to_s(x)[1] / _dot(slopes, self.denominator)
-        residues = _dot(self.numerator_basis.at(x, 0)[0], self.numerator) * factor
-        return residues, values[..., :-1] * -factor[..., None]
+        points = math.prod(x.shape[:-1])
+        arrays = (x, self.variable.to_s(x)[1], self.denominator, self.numerator)
+        residues, sensitivity = _residues_and_sensitivity(
+            *(array.reshape(points, array.shape[-1]) for array in arrays),
+            self.denominator_basis.hessenberg,
+            self.numerator_basis.hessenberg,
+        )
+        return residues.reshape(x.shape), sensitivity.reshape(*x.shape, sensitivity.shape[-1])
 
     def zero_sensitivity(self, zeros_rad_s: ComplexArray) -> ComplexArray:
         """(..., k, m + 1) derivative of simple zeros (..., k) by the coefficients of B."""
@@ -149,6 +154,45 @@ class RationalModel:
         by_alpha = by_x[..., None] * dx - (residue / a1 * map_1)[..., None] * slopes[..., :-1]
         by_beta = b_values * (map_1 / a1)[..., None]
         return np.concatenate([by_alpha, by_beta], axis=-1)
+
+
+@entry
+def _residues_and_sensitivity(x, ds_dx, denominator, numerator, hessenberg_a, hessenberg_b):
+    """Of models (points, terms) at their poles x (points, k), (points, k) and (points, k, n)."""
+    (points, count), n, terms = x.shape, hessenberg_a.shape[1], hessenberg_b.shape[1] + 1
+    residues = np.empty((points, count), np.complex128)
+    sensitivity = np.empty((points, count, n), np.complex128)
+    value, slope = np.empty(max(n + 1, terms), np.complex128), np.empty(n + 1, np.complex128)
+    for point in range(points):
+        for k in range(count):
+            at = x[point, k]
+            value[0], slope[0], derivative = 1.0, 0.0, 0j
+            for i in range(n):
+                new, more = at * value[i], at * slope[i] + value[i]
+                for j in range(i + 1):
+                    new -= hessenberg_a[j, i] * value[j]
+                    more -= hessenberg_a[j, i] * slope[j]
+                value[i + 1], slope[i + 1] = new / hessenberg_a[i + 1, i], more / hessenberg_a[i + 1, i]
+                derivative += slope[i + 1] * denominator[point, i + 1]
+            # A(x; a) = 0 along the root: dx = - dA / A'
+            factor = ds_dx[point, k] / derivative
+            for i in range(n):
+                sensitivity[point, k, i] = -factor * value[i]
+            above = complex(numerator[point, 0])
+            for i in range(terms - 1):
+                new = at * value[i]
+                for j in range(i + 1):
+                    new -= hessenberg_b[j, i] * value[j]
+                value[i + 1] = new / hessenberg_b[i + 1, i]
+                above += value[i + 1] * numerator[point, i + 1]
+            residues[point, k] = above * factor
+    return residues, sensitivity
+
+
+@rehearsal
+def _find_a_residue() -> None:
+    one, two = np.ones((1, 1)), np.ones((1, 2))
+    _residues_and_sensitivity(one + 0j, one + 0j, two, two, two.T, two.T)
 
 
 def _dot(basis: ComplexArray, coefficients: FloatArray) -> ComplexArray:

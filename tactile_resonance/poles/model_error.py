@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_resonance._typing import ComplexArray, FloatArray
-from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.fit import RULES
 from tactile_resonance.poles.result import natural_frequency_and_damping
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 MODEL_ERROR_PROBABILITY = 1e-3
 # Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
 # in particular.
-COMPARISON_ITERATIONS = 8
+COMPARISON = RULES._replace(iterations=8)
 
 
 def systematic_of(
@@ -51,7 +52,7 @@ def systematic_of(
     poles = []
     for parity in (0, 1):
         left_out = np.arange(data.driven) % 2 == parity
-        half = replace(data, variance_y=np.where(left_out, np.inf, data.variance_y))
+        half = data.weighted(variance_y=np.where(left_out, np.inf, data.variance_y))
         poles.append(plan.compared(half, theta)[0])
     systematic = difference_of_halves(*poles)
     half_of = data.records // 2
@@ -67,7 +68,7 @@ def systematic_of(
 
 def _fewest_lines(data: BinData) -> int:
     """Driven bins of a point that are not left out."""
-    used = np.isfinite(data.variance_y[:, 0])
+    used = np.isfinite(data.variance_y)
     return int(np.broadcast_to(used, (len(used), data.driven)).sum(axis=-1).min())
 
 

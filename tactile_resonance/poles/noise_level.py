@@ -15,12 +15,14 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
+from tactile_resonance.poles.compiled import entry, inner, rehearsal
 
 # Bartlett's test rejects a flat variance wrongly in one of ten thousand bands.
 FALSE_ALARM = 1e-4
 REWEIGHTINGS = 3
 # Of the mean over the band: below it a fitted variance is taken for an accident.
 LEAST_VARIANCE = 1e-3
+TINY = float(np.finfo(float).tiny)
 KINDS = ("flat", "sloped", "per line")
 
 
@@ -77,16 +79,39 @@ class VarianceModel:
     def contradicts(self, cost: FloatArray, parameters: int, probability: float) -> BoolArray:
         """(batch,) whether noise alone exceeds a cost more rarely; False where that cannot be determined."""
         free = np.maximum(self.lines - parameters / 2, 0.5)
-        chance = special.fdtrc(2 * free, 2 * self.pooled_dof, cost / free)
-        if self.dof > 2:
-            # moments of F(2, 2 nu)
-            nu = self.dof
-            mean = nu / (nu - 1)
-            std = mean * np.sqrt(nu / (nu - 2))
-            per_line = special.ndtr((free * mean - cost) / (np.sqrt(free) * std))
-        else:
-            per_line = np.ones(free.shape)
-        return np.asarray(np.where(self.kind == 2, per_line, chance) < probability)
+        rare = is_rare(cost / free, free, self.pooled_dof, probability)
+        by_line = self.kind == 2
+        if by_line.any():
+            rare[by_line] = False
+            if self.dof > 2:
+                # moments of F(2, 2 nu)
+                nu = self.dof
+                mean = nu / (nu - 1)
+                std = mean * np.sqrt(nu / (nu - 2))
+                above = (cost - free * mean) / (np.sqrt(free) * std)
+                rare |= by_line & (above > -special.ndtri(probability))
+        return rare
+
+
+def is_rare(
+    ratio: FloatArray, dof: FloatArray, other_dof: FloatArray, probability: float
+) -> BoolArray:
+    """(batch,) whether chance makes a ratio of two variances more rarely than this.
+
+    Parameters
+    ----------
+    ratio : (batch,) float
+    dof, other_dof : (batch,) float
+        Complex degrees of freedom of the first and of the second.
+    probability : float
+        Well below that of a ratio of 1.
+    """
+    rare = np.asarray(ratio > 1)
+    rows = np.flatnonzero(rare)
+    if rows.size:  # others need no special function
+        chance = special.fdtrc(2 * dof[rows], 2 * other_dof[rows], ratio[rows])
+        rare[rows] = chance < probability
+    return rare
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -113,41 +138,158 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
     ----------
     Bartlett, *Properties of sufficiency and statistical tests*, Proc. R. Soc. A 160 (1937) 268-282.
     """
-    usable = (variance > 0) & np.isfinite(variance)
-    lines = usable.sum(axis=-1)
-    count = np.maximum(lines, 1)
-    whole = bool(usable.all())
-    known = variance if whole else np.where(usable, variance, 0.0)
-    mean = known.sum(axis=-1, keepdims=True) / count[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log = np.log(variance if whole else np.where(usable, variance, 1.0))
-        log_mean = log.sum(axis=-1) / count
-        kind = np.zeros(variance.shape[0], np.int64)
-        if gain is None:
-            model = np.broadcast_to(mean, variance.shape)
-            spread = np.log(mean[:, 0]) - log_mean
-        else:
-            model = two_channels(known, gain, usable)
-            ratio = known / model  # 0 where a line is left out
-            log_model = np.log(model) if whole else np.where(usable, np.log(model), 0.0)
-            spread = np.log(ratio.sum(axis=-1) / count) - log_mean + log_model.sum(axis=-1) / count
-        unequal = spread > _bartlett_limit(lines, dof, 1 if gain is None else 2)
-    if unequal.any():
-        model = model.copy()
-        rest = np.flatnonzero(unequal)
-        curve = log_linear(known[rest], usable[rest])
-        ratio = np.where(usable[rest], known[rest] / curve, 1.0)
-        with np.errstate(divide="ignore"):
-            spread = (
-                np.log((ratio * usable[rest]).sum(axis=-1) / count[rest])
-                - np.sum(np.log(ratio), axis=-1) / count[rest]
-            )
-        each = spread > _bartlett_limit(lines[rest], dof, 2)
-        model[rest] = np.where(each[:, None], variance[rest], curve)
-        kind[rest] = np.where(each, 2, 1)
-    if not whole:
-        model = np.where(usable, model, np.inf)
+    channels = 1 if gain is None else 2
+    limits = (_flat_limits(variance.shape[1], dof, n) for n in (channels, 2))
+    gain = np.empty((len(variance), 0)) if gain is None else gain
+    model, kind, lines = _modelled(np.asarray(variance, float), gain, *limits)
     return VarianceModel(model, lines, dof, kind)
+
+
+@entry
+def _modelled(variance, gain, flat, sloped):
+    """Variances (points, F) to weight with, their kinds, and how many lines are used.
+
+    `flat`, `sloped` (F + 1,): limits of the tests for so many lines.
+    """
+    points, lines = variance.shape
+    model, kind, used = np.empty((points, lines)), np.zeros(points, np.int64), np.zeros(points, np.int64)
+    usable, sample = np.empty(lines), np.empty(lines)
+    for point in range(points):
+        total = 0.0
+        for k in range(lines):
+            good = 0 < variance[point, k] < np.inf
+            usable[k] = 1.0 if good else 0.0
+            sample[k] = variance[point, k] if good else 0.0
+            total += sample[k]
+            used[point] += good
+        if gain.shape[1] > 0:
+            _add_channels(sample, gain[point], usable, model[point])
+        else:
+            model[point] = total / max(used[point], 1)
+        if _spread(sample, model[point], usable, used[point]) > flat[used[point]]:
+            kind[point] = 1
+            _fit_slope(sample, usable, model[point])
+            if _spread(sample, model[point], usable, used[point]) > sloped[used[point]]:
+                kind[point] = 2
+                model[point] = sample
+        for k in range(lines):
+            if usable[k] == 0:
+                model[point, k] = np.inf
+    return model, kind, used
+
+
+@inner
+def _spread(sample, model, usable, used):
+    """``log mean - mean log`` of samples over their model."""
+    total, logarithm, product = 0.0, 0.0, 1.0
+    for k in range(sample.size):
+        if usable[k] > 0:
+            ratio = sample[k] / model[k]
+            total += ratio
+            product *= ratio
+            if not 1e-100 < product < 1e100:  # a logarithm costs as much as all else
+                logarithm += np.log(product)
+                product = 1.0
+    return np.log(total / used) - (logarithm + np.log(product)) / used
+
+
+@inner
+def _add_channels(sample, gain, usable, model):
+    """A fit of `two_channels`, to samples (F,) that are 0 where not usable."""
+    lines = sample.size
+    scale = level = used = 0.0
+    for k in range(lines):
+        scale += sample[k]
+        level += usable[k] * gain[k] if usable[k] > 0 else 0.0
+        used += usable[k]
+    scale, level = scale / max(used, 1.0), max(level / max(used, 1.0), TINY)
+    for k in range(lines):
+        model[k] = 1.0
+    for _ in range(REWEIGHTINGS):
+        s0 = s1 = s2 = t0 = t1 = 0.0
+        for k in range(lines):
+            weight = usable[k] / (model[k] * model[k])
+            x, y = gain[k] / level if usable[k] > 0 else 0.0, sample[k] / scale
+            s0 += weight
+            s1 += weight * x
+            s2 += weight * x * x
+            t0 += weight * y
+            t1 += weight * x * y
+        determinant = s0 * s2 - s1 * s1
+        b = (s0 * t1 - s1 * t0) / determinant if determinant > 1e-9 * s0 * s2 else 0.0
+        a = (t0 - b * s1) / s0
+        if b < 0:
+            b = 0.0
+        elif a < 0:
+            b = t1 / s2
+        a = max((t0 - b * s1) / s0, 0.0)
+        for k in range(lines):
+            model[k] = max(a + b * (gain[k] / level if usable[k] > 0 else 0.0), LEAST_VARIANCE)
+    for k in range(lines):
+        model[k] *= scale
+
+
+@inner
+def _fit_slope(sample, usable, model):
+    """A fit of `log_linear`."""
+    lines = sample.size
+    used = i01 = i11 = total = 0.0
+    for k in range(lines):
+        x = 2 * k / (lines - 1) - 1
+        used += usable[k]
+        i01 += usable[k] * x
+        i11 += usable[k] * x * x
+        total += sample[k]
+    determinant = used * i11 - i01 * i01
+    c0, c1 = np.log(total / max(used, 1.0)), 0.0
+    for _ in range(50):
+        g0 = g1 = 0.0
+        for k in range(lines):
+            if usable[k] > 0:
+                x = 2 * k / (lines - 1) - 1
+                excess = sample[k] * np.exp(-c0 - c1 * x) - 1
+                g0 += excess
+                g1 += excess * x
+        step_0, step_1 = (i11 * g0 - i01 * g1) / determinant, (used * g1 - i01 * g0) / determinant
+        # some decades at most: the score is far from linear where the ratio is large
+        c0 += min(max(step_0, -2.0), 2.0)
+        c1 += min(max(step_1, -2.0), 2.0)
+        if max(abs(step_0), abs(step_1)) < 1e-10:
+            break
+    for k in range(lines):
+        model[k] = np.exp(c0 + c1 * (2 * k / (lines - 1) - 1))
+
+
+@entry
+def two_channels(variance, gain):
+    """(batch, F) fit of ``a + b gain``, neither negative, to gamma distributed variances.
+
+    Iteratively reweighted least squares is maximum likelihood here: the variance of a gamma
+    variable is proportional to its squared mean.
+    """
+    model, usable = np.empty_like(variance), np.ones(variance.shape[1])
+    for point in range(variance.shape[0]):
+        _add_channels(variance[point], gain[point], usable, model[point])
+    return model
+
+
+@entry
+def log_linear(variance):
+    """(batch, F) maximum likelihood fit of ``exp(c_0 + c_1 x)`` to gamma distributed variances.
+
+    By Fisher scoring.
+    """
+    model, usable = np.empty_like(variance), np.ones(variance.shape[1])
+    for point in range(variance.shape[0]):
+        _fit_slope(variance[point], usable, model[point])
+    return model
+
+
+@rehearsal
+def _model_a_little() -> None:
+    model_variance(np.ones((1, 3)), 2)
+    two_channels(np.ones((1, 3)), np.ones((1, 3)))
+    log_linear(np.ones((1, 3)))
 
 
 def are_flat(variance: FloatArray, dof: int) -> BoolArray:
@@ -159,72 +301,15 @@ def are_flat(variance: FloatArray, dof: int) -> BoolArray:
     return np.asarray(spread <= limit)  # NaN, where a variance is not positive, is not flat
 
 
-@lru_cache(maxsize=256)
 def flat_limit(lines: int, dof: int) -> float:
     """Largest ``log mean - mean log`` that `are_flat` lets pass."""
-    return float(_bartlett_limit(np.array(lines), dof, 1))
+    return float(_flat_limits(lines, dof, 1)[-1])
 
 
-def _bartlett_limit(lines: IntArray, dof: int, parameters: int) -> FloatArray:
-    """Largest ``log mean - mean log`` of variance ratios that passes the test."""
-    real_dof = 2 * dof
-    count = np.maximum(lines, parameters + 1).astype(float)
-    correction = 1 + (count + 1) / (3 * count * real_dof)
+@lru_cache(maxsize=256)
+def _flat_limits(most: int, dof: int, parameters: int) -> FloatArray:
+    """(most + 1,) largest ``log mean - mean log`` of variance ratios of so many lines that passes the test."""
+    count = np.maximum(np.arange(most + 1), parameters + 1).astype(float)
+    correction = 1 + (count + 1) / (6 * count * dof)
     quantile = special.chdtri(count - parameters, FALSE_ALARM)
-    return quantile * correction / (real_dof * count)
-
-
-def two_channels(variance: FloatArray, gain: FloatArray, usable: BoolArray) -> FloatArray:
-    """(batch, F) fit of ``a + b gain``, neither negative, to gamma distributed variances.
-
-    Iteratively reweighted least squares is maximum likelihood here: the variance of a gamma
-    variable is proportional to its squared mean.
-    """
-    lines = np.maximum(usable.sum(axis=-1), 1)
-    whole = bool(usable.all())
-    scale = variance.sum(axis=-1, keepdims=True) / lines[:, None]
-    level = gain if whole else np.where(usable, gain, 0.0)
-    mean = level.sum(axis=-1, keepdims=True) / lines[:, None]
-    level = level / np.maximum(mean, np.finfo(float).tiny)
-    sample = variance / scale
-    weight = usable.astype(float)
-    for _ in range(REWEIGHTINGS):
-        by_level = weight * level
-        s0, s1 = weight.sum(axis=-1), by_level.sum(axis=-1)
-        s2, t0, t1 = (
-            np.einsum("bf,bf->b", first, second)
-            for first, second in ((by_level, level), (weight, sample), (by_level, sample))
-        )
-        determinant = s0 * s2 - s1**2
-        b = np.where(determinant > 1e-9 * s0 * s2, (s0 * t1 - s1 * t0) / determinant, 0.0)
-        a = (t0 - b * s1) / s0
-        b = np.where(b < 0, 0.0, np.where(a < 0, t1 / s2, b))
-        a = np.maximum((t0 - b * s1) / s0, 0.0)
-        model = np.maximum(a[:, None] + b[:, None] * level, LEAST_VARIANCE)
-        weight = 1 / model**2
-        if not whole:
-            weight[~usable] = 0.0
-    return model * scale
-
-
-def log_linear(variance: FloatArray, usable: BoolArray) -> FloatArray:
-    """(batch, F) maximum likelihood fit of ``exp(c_0 + c_1 x)`` to gamma distributed variances.
-
-    By Fisher scoring, over the usable lines.
-    """
-    x = np.linspace(-1, 1, variance.shape[-1])
-    design = np.column_stack([np.ones_like(x), x])  # (F, 2)
-    count = np.maximum(usable.sum(axis=-1), 1)
-    coefficients = np.stack(
-        [np.log(variance.sum(axis=-1) / count), np.zeros(variance.shape[0])], axis=-1
-    )
-    information = np.einsum("bf,fi,fj->bij", usable.astype(float), design, design)
-    for _ in range(50):
-        ratio = variance * np.exp(-coefficients @ design.T)
-        score = np.where(usable, ratio - 1, 0.0) @ design
-        step = np.linalg.solve(information, score[..., None])[..., 0]
-        # some decades at most: the score is far from linear where the ratio is large
-        coefficients = coefficients + np.clip(step, -2.0, 2.0)
-        if np.max(np.abs(step)) < 1e-10:
-            break
-    return np.exp(coefficients @ design.T)
+    return np.asarray(quantile * correction / (2 * dof * count))

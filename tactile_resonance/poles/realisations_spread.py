@@ -16,8 +16,8 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
-from tactile_resonance.poles.bins import BinData
 from tactile_resonance.poles.covariance import real_rows
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.likelihood import invert, moments
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
@@ -84,7 +84,7 @@ class Spread:
         """
         a, b, _ = plan.problem.sizes
         batch, records, n = theta.shape
-        _, gradient, normal = moments(plan.problem.tables, data.arrays, theta)
+        _, gradient, normal = moments(plan.problem.tables, data, theta)
         inverse = invert(normal.sum(axis=2).reshape(-1, n, n))[0]
         step = -(inverse @ gradient.reshape(-1, n, 1))[:, : a + b, 0]
         inverse = inverse[:, :a]  # (batch M, a, n)

@@ -120,12 +120,11 @@ def smooth_variance(
     pieces : Pieces
     """
     kind = model_variance(pieces.means(sample), pieces.dof, pieces.means(gain)).kind
-    every = np.ones(sample.shape, bool)
-    variance = two_channels(sample, gain, every)
+    variance = two_channels(sample, gain)
     sloped, each = kind == 1, kind == 2
     if sloped.any():  # with noise of both channels, whose sum follows the resonance
-        curve = log_linear(sample[sloped], every[sloped])
-        more = two_channels(sample[sloped] / curve, gain[sloped], every[sloped])
+        curve = log_linear(sample[sloped])
+        more = two_channels(sample[sloped] / curve, gain[sloped])
         variance[sloped] = curve * more
     if each.any():
         variance[each] = pieces.means(sample[each])[:, pieces.of_line]

@@ -7,14 +7,14 @@ there: the cost has a minimum with a single mode for both, and the other one fit
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
-from tactile_resonance.poles.bins import BinData, Problem
-from tactile_resonance.poles.fit import MAX_ITERATIONS, Linearised, Solution, minimise
+from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.fit import RULES, Linearised, Solution, minimise
+from tactile_resonance.poles.likelihood import Rules
 from tactile_resonance.poles.model import RationalModel
+from tactile_resonance.poles.tables import Problem
 
 SEVERAL_MODES = 4
 """Order from which on a model has more than one mode."""
@@ -28,7 +28,7 @@ def best_of_split(
     data: BinData,
     model: RationalModel,
     solution: Solution,
-    max_iterations: int = MAX_ITERATIONS,
+    rules: Rules = RULES,
 ) -> Solution:
     """The solution, or that from a start with its highest peak split, whichever costs less.
 
@@ -40,20 +40,18 @@ def best_of_split(
         Of the solution, one a point.
     solution : Solution
         Of a denominator of order 4 or more.
-    max_iterations : int
+    rules : Rules
     """
     start, there = _split_starts(problem, data, model)
     rows = np.flatnonzero(there)
     if not rows.size:
         return solution
-    again = minimise(problem, data.rows(rows), start[rows], max_iterations)
+    again = minimise(problem, data.rows(rows), start[rows], rules)
     better = again.converged & (
         ~solution.converged[rows] | (again.cost < solution.cost[rows] * (1 - 1e-9))
     )
-    best = Solution(*(getattr(solution, f.name).copy() for f in fields(Solution)))
-    for name in (f.name for f in fields(Solution)):
-        getattr(best, name)[rows[better]] = getattr(again, name)[better]
-    return best
+    solution.put(rows[better], again.rows(better))
+    return solution
 
 
 @np.errstate(all="ignore")
@@ -117,9 +115,10 @@ def coefficients_of_roots(
     theta[:a] = denominator[:-1] / denominator[-1]
     linear = Linearised.of(problem, data, theta)
     used = np.isfinite(linear.variance)
-    weight = 1 / np.sqrt(linear.variance[used])
+    weight = np.tile(1 / np.sqrt(linear.variance[used]), data.records)
     theta[a:] = _real_solution(
-        linear.slope[used][:, a:] * weight[:, None], linear.error[used] * weight
+        linear.slope[:, used, a:].reshape(weight.size, -1) * weight[:, None],
+        linear.error[:, used].ravel() * weight,
     )
     return theta
 

@@ -1,22 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Basis functions and values of bins in the blocks that the kernels of `likelihood` work on.
-
-What numba compiles stands in `likelihood` alone: its cache looks at the date of that file.
-"""
+"""Basis functions of the model on bins, in the blocks that the functions of `likelihood` work on."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-from numba.core import event
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles import likelihood
+from tactile_resonance.poles.compiled import compiled, rehearsal
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.likelihood import (
     BLOCK,
     ROW_A,
@@ -161,13 +158,21 @@ def _blocks(rows: list[FloatArray], blocks: int) -> FloatArray:
 
 
 class Tables(NamedTuple):
-    """Basis functions on all bins, and the numbers of coefficients of A, B and C."""
+    """Basis functions on all bins, and the numbers of coefficients of A, B and C.
+
+    Attributes
+    ----------
+    from_driven : bool
+        Whether the driven bins hold equations enough for start values. Of a record of many periods they are
+        a small part of all bins, and the most informative one.
+    """
 
     undriven: Part
     driven: Part
     a: int
     b: int
     c: int
+    from_driven: bool
 
     @classmethod
     def of(
@@ -181,94 +186,74 @@ class Tables(NamedTuple):
             Part.of(denominator[here, a], [transient[here], denominator[here, :a], *more], n)
             for here, more in ((slice(0, first), ()), (slice(first, None), (numerator,)))
         )
-        return cls(undriven, driven, a, b, c)
+        return cls(undriven, driven, a, b, c, bool(first > 0 and numerator.shape[0] >= n))
 
 
-def from_planes(blocks: FloatArray, undriven: int, driven: int) -> ComplexArray:
-    """Complex values (points, M, K) of `planes`."""
-    points, records, count = blocks.shape[:3]
-    values = (blocks[..., 0, :] + 1j * blocks[..., 1, :]).reshape(points, records, count * BLOCK)
-    first = -(-undriven // BLOCK) * BLOCK
-    return np.concatenate([values[..., :undriven], values[..., first : first + driven]], axis=-1)
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Basis functions on K bins, the undriven ones first.
 
-
-def in_blocks(values: Sequence[npt.NDArray], points: int = 1) -> FloatArray:
-    """Real values (points, M or 1, K or 1) in blocks (points, M or 1, blocks, how many, BLOCK), filled with 1.
-
-    One block of one for all bins where the last axis is 1 long; no block where there are no values.
+    Attributes
+    ----------
+    denominator : (K, a + 1) complex
+        The last coefficient of A is fixed at 1.
+    numerator : (K_driven, b) complex
+    transient : (K, c) complex
+        Of no terms where there is no transient.
     """
-    if not values:
-        return np.empty((points, 1, 0, 1, 1))
-    shape, bins = values[0].shape[:-1], values[0].shape[-1]
-    if bins == len(values) == 1:
-        return np.ascontiguousarray(values[0], float)[..., None, None]
-    if bins == 1:
-        return np.ascontiguousarray(np.stack(values, axis=-2), float)[..., None, :, :]
-    blocks = -(-bins // BLOCK)
-    out = np.ones((*shape, blocks * BLOCK, len(values)))
-    for k, value in enumerate(values):
-        out[..., :bins, k] = value
-    out = out.reshape(*shape, blocks, BLOCK, len(values))
-    return np.ascontiguousarray(out.swapaxes(-1, -2))
+
+    denominator: ComplexArray
+    numerator: ComplexArray
+    transient: ComplexArray
+
+    @classmethod
+    def of_lines(cls, denominator: ComplexArray, numerator: ComplexArray) -> Problem:
+        """Driven bins without transient."""
+        return cls(denominator, numerator, np.empty((denominator.shape[0], 0), complex))
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of free coefficients of A, B and C."""
+        a, b, c = (x.shape[1] for x in (self.denominator, self.numerator, self.transient))
+        return a - 1, b, c
+
+    @property
+    def undriven(self) -> int:
+        """Number of bins without input."""
+        return int(self.denominator.shape[0] - self.numerator.shape[0])
+
+    @cached_property
+    def tables(self) -> Tables:
+        """For `likelihood`."""
+        compiled()  # here and not in the first fit, whose time may matter
+        return Tables.of(self.denominator, self.numerator, self.transient)
+
+    def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Coefficients of A (with its last), B and C, each (..., terms), of theta (..., n)."""
+        a, b, _ = self.sizes
+        one = np.ones((*theta.shape[:-1], 1))
+        return (
+            np.concatenate([theta[..., :a], one], axis=-1),
+            np.ascontiguousarray(theta[..., a : a + b]),
+            np.ascontiguousarray(theta[..., a + b :]),
+        )
+
+    def response(self, theta: FloatArray) -> ComplexArray:
+        """(batch, K_driven) B / A of coefficients (batch, n)."""
+        alpha, beta, _ = self.split(theta)
+        return np.asarray(beta @ self.numerator.T / (alpha @ self.denominator[self.undriven :].T))
 
 
-@cache
-def compiled() -> int:
-    """How many kernels were not in the cache and had to be compiled, of those that fits call.
-
-    About a minute of work, once per installation, which the log says before it begins.
-    """
-    with event.install_listener("numba:compile", _Notice()):
-        _call_kernels()
-    return sum(sum(kernel.stats.cache_misses.values()) for kernel in likelihood.KERNELS)
-
-
-class _Notice(event.Listener):
-    """Says on the log that kernels are compiled, as the first of them begins."""
-
-    def __init__(self) -> None:
-        self._said = False
-
-    def on_start(self, event: object) -> None:
-        """Say it once."""
-        if not self._said:
-            logging.getLogger(__name__).warning(
-                "compiling the pole fits, once per installation: about a minute; ahead of the first use: "
-                "tactile_resonance compile"
-            )
-        self._said = True
-
-    def on_end(self, event: object) -> None:
-        """Nothing to say."""
-
-
-def _call_kernels() -> None:
-    """Call each kernel that a fit calls, on a little data."""
+@rehearsal
+def _fit_a_little() -> None:
     bins, undriven = 4 * BLOCK, 3 * BLOCK
     s = 1j * np.linspace(0.8, 1.2, bins)
     one = np.ones((bins, 1), complex)
     tables = Tables.of(np.stack([one[:, 0], s, s**2 + 0.5], axis=-1), one[undriven:], one)
     rng = np.random.default_rng(0)
     u = rng.standard_normal((1, 1, bins, 2)).view(complex)[..., 0]
-    y = u / (s**2 + 0.04 * s + 1)
-    flat = in_blocks([np.ones((1, 1, 1))])
-    order = np.arange(bins)
-    data = likelihood.Arrays(
-        likelihood.planes(y, order, undriven),
-        likelihood.planes(u, order, undriven),
-        flat,
-        flat,
-        flat,
-        in_blocks([]),
-    )
-    theta, _ = likelihood.begin(tables, True, data, 1.0, BLOCK, 3)
-    likelihood.linear_fit(tables, data, theta, likelihood.LINEAR)
-    likelihood.undriven_powers(tables, data, theta, BLOCK, 3)
-    likelihood.undriven_errors(tables, data, theta)
-    likelihood.minimise(tables, data, theta, 2, 1e-2, 1e-14)
-    inverse, _ = likelihood.invert(likelihood.moments(tables, data, theta)[2][:, 0, 1])
-    modes = np.ones((1, 2, 2, bins - undriven))
-    two = np.ones((bins - undriven, 2), complex)
-    bases = (two, one[undriven:], one[undriven:])
-    at, inverse = theta[:, 0, :3], inverse[:, :3, :3]
-    likelihood.best_fall(tables, data, bases, at, inverse, np.ones(1), 9.0, two, modes)
+    data = BinData.of(u / (s**2 + 0.04 * s + 1), u, np.arange(bins), undriven)
+    rules = likelihood.Rules(2, 1e-2, 1e-14, 3, BLOCK, 1.0, 1.0)
+    theta, *_ = likelihood.minimise(tables, data, np.empty((0, 1, 4)), rules)
+    _, _, normal = likelihood.moments(tables, data, theta)
+    likelihood.invert(normal[:, 0, 1])

@@ -17,6 +17,7 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance.poles.compiled import entry, rehearsal
 
 # Residuals of noise alone are smoother than this once in a thousand fits.
 SMOOTH_RESIDUAL = 3.09
@@ -36,7 +37,7 @@ def components(lines: int, parameters: int) -> tuple[IntArray, FloatArray]:
     levels = np.array([most])
     while levels[0] > 2 * parameters:
         levels = np.append(levels[0] // 2, levels)
-    line, k = np.ogrid[:lines, :most]
+    line, k = np.ogrid[:lines, : -(-most // 8) * 8]  # as many as vectors hold
     cosines = np.cos(np.pi * k * (line + 0.5) / lines) * np.sqrt(np.where(k == 0, 1, 2) / lines)
     return levels, cosines
 
@@ -87,37 +88,47 @@ def _limit(levels: int, limit: float) -> float:
     return float(-special.ndtri(each))
 
 
-@np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def _best_level(residual: ComplexArray, parameters: int) -> tuple[FloatArray, int]:
     """(...) normal score of the most significant level, and how many levels there are."""
     lines = residual.shape[-1]
     if lines < 3:
         return np.full(residual.shape[:-1], np.nan), 1
     counts, cosines = components(lines, parameters)
-    parts = np.stack([residual.real, residual.imag])  # (2, ..., F)
-    power = _squared(parts @ cosines).cumsum(axis=-1)
-    smooth = power[..., counts - 1]
-    total = _squared(parts).sum(axis=-1, keepdims=True)
-    if residual.all():
-        ratio, a, b = _whole(lines, parameters)
-    else:
-        ratio, a, b = _terms(counts, np.count_nonzero(residual, axis=-1)[..., None])
-    root = np.cbrt(smooth / (total - smooth) * ratio)
-    score = np.max(((1 - b) * root - (1 - a)) / np.sqrt(b * root**2 + a), axis=-1)
-    return score, counts.size
+    scores = _scores(np.asarray(residual, complex).reshape(-1, lines), counts, cosines)
+    return scores.reshape(residual.shape[:-1]), counts.size
 
 
-@lru_cache(maxsize=64)
-def _whole(lines: int, parameters: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return _terms(components(lines, parameters)[0], np.array(lines))
+@entry
+def _scores(residual, counts, cosines):
+    """(points,) score of residuals (points, F) for numbers of cosines (levels,), of cosines (F, J)."""
+    points, lines = residual.shape
+    most = cosines.shape[1]
+    re, im, scores = np.empty(most), np.empty(most), np.empty(points)
+    for point in range(points):
+        total, used = 0.0, 0
+        re[:] = 0.0
+        im[:] = 0.0
+        for k in range(lines):
+            x, y = residual[point, k].real, residual[point, k].imag
+            total += x * x + y * y
+            used += x != 0 or y != 0
+            for j in range(most):
+                re[j] += cosines[k, j] * x
+                im[j] += cosines[k, j] * y
+        smooth, best, first = 0.0, -np.inf, 0
+        for count in counts:
+            for j in range(first, count):
+                smooth += re[j] * re[j] + im[j] * im[j]
+            first = count
+            others = max(used - count, 1)
+            root = (smooth / (total - smooth) * others / count) ** (1 / 3)
+            a, b = 1 / (9 * count), 1 / (9 * others)
+            score = ((1 - b) * root - (1 - a)) / np.sqrt(b * root * root + a)
+            best = score if not score <= best else best  # not a number where the first one is none
+        scores[point] = best
+    return scores
 
 
-def _terms(counts: IntArray, used: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Ratio of the degrees of freedom, and 1/9 over half of either, for so many lines in use."""
-    others = np.maximum(used - counts, 1)
-    return others / counts, 1 / (9 * counts), 1 / (9 * others)
-
-
-def _squared(parts: FloatArray) -> FloatArray:
-    """(...) squared moduli of real over imaginary parts (2, ...)."""
-    return np.asarray(parts[0] ** 2 + parts[1] ** 2)
+@rehearsal
+def _score_a_little() -> None:
+    _scores(np.ones((1, 3), complex), *components(3, 1))

@@ -12,7 +12,7 @@ from benchmarks.poles_plant import (
     SAMPLES_PER_PERIOD,
     Plant,
 )
-from tactile_resonance.poles.bins import BinData
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.lacking import lacking_terms
 from tactile_resonance.poles.likelihood import invert, moments
@@ -116,12 +116,17 @@ def test_a_complete_model_lacks_nothing(cell, structure):
     fit = plan.from_bins(u, y)
     theta = [fit.fit.denominator[:, :-1], fit.fit.numerator, fit.fit.transient]
     variance_y, variance_u = (np.ascontiguousarray(v) for v in np.split(fit.noise_variance, 2, 1))
-    of_y, of_u = (v[:, None] for v in (variance_y, variance_u))
     data = BinData.of(
-        y[:, None], u[:, None], plan.other_bins.size, of_y, of_u, None, of_y, order=plan.order
+        y[:, None],
+        u[:, None],
+        plan.order,
+        plan.other_bins.size,
+        rest=variance_y,
+        variance_y=variance_y,
+        variance_u=variance_u,
     )
     theta = np.concatenate(theta, axis=1)
-    cost, _, normal = moments(plan.problem.tables, data.arrays, theta[:, None])
+    cost, _, normal = moments(plan.problem.tables, data, theta[:, None])
     inverse, _ = invert(normal[:, 0].sum(axis=1))
     lacking = lacking_terms(plan, data, theta, inverse, cost.sum(axis=1))
     alarms = np.isfinite(lacking[:, 0]).sum()

@@ -9,19 +9,13 @@ from scipy import stats
 
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
 from tactile_resonance.poles.basis import PolynomialBasis
-from tactile_resonance.poles.bins import BinData, Problem
-from tactile_resonance.poles.fit import (
-    Linearised,
-    RecordsInverse,
-    least_squares,
-    minimise,
-    refit_failed,
-    start_values,
-)
+from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.fit import RULES, Linearised, least_squares, minimise, refit_failed
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.likelihood import invert, moments
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.tables import Problem
 
 RNG = np.random.default_rng(4)
 BARE = ModelStructure(2, 2)
@@ -51,13 +45,23 @@ def problem_and_data(points, records, errors_in_variables, transient, driven=15)
     )
     if transient:
         y += (0.05 * RNG.random((points, records, 1)) + 0.02 * x[order]) / a
-    extra = (None, None)
+    data = BinData.of(
+        y,
+        u,
+        undriven=undriven,
+        variance_y=1e-4 * (1 + RNG.random((points, driven))),
+        rest=2e-4 * (1 + RNG.random((points, max(undriven, 1)))),
+    )
     if errors_in_variables:
-        extra = (1e-4 * (1 + RNG.random((points, 1, driven))), 3e-5 * normal(points, 1, driven))
-    variance = 1e-4 * (1 + RNG.random((points, records, driven)))
-    rest = np.full((points, 1, 1), 2e-4)
-    data = BinData.of(y, u, undriven, variance, *extra, rest if undriven else None)
+        data = data.weighted(
+            variance_u=1e-4 * (1 + RNG.random((points, driven))),
+            covariance_yu=3e-5 * normal(points, driven),
+        )
     return Problem(denominator, numerator, own), data
+
+
+def start_values(problem, data):
+    return minimise(problem, data, None, RULES._replace(iterations=0)).theta
 
 
 def flat_theta(problem, theta):
@@ -76,7 +80,7 @@ def test_cost_and_normal_matrix_are_those_of_the_formula(
     """Blocks that are full, that are not, and several of them."""
     problem, data = problem_and_data(3, records, errors_in_variables, transient, driven)
     theta = start_values(problem, data)
-    cost, _, found = moments(problem.tables, data.arrays, theta)
+    cost, _, found = moments(problem.tables, data, theta)
     a, b, own = problem.sizes
     for k in range(3):
         at = Linearised.of(problem, data.rows(slice(k, k + 1)), flat_theta(problem, theta[k]))
@@ -103,9 +107,9 @@ def test_gradient_is_that_of_the_cost(errors_in_variables, records):
     shared = sum(problem.sizes[:2])
 
     def cost(at):
-        return moments(problem.tables, data.arrays, at)[0].sum()
+        return moments(problem.tables, data, at)[0].sum()
 
-    gradient = moments(problem.tables, data.arrays, theta)[1][0]
+    gradient = moments(problem.tables, data, theta)[1][0]
     for i in range(theta.shape[-1]):
         step = np.zeros_like(theta)
         which = slice(None) if i < shared else 0  # what records share changes in all
@@ -123,7 +127,6 @@ def test_the_minimum_is_that_of_full_precision(errors_in_variables, transient, r
     found = minimise(problem, data)
     assert found.converged.all()
     shared = sum(problem.sizes[:2])
-    inverse = RecordsInverse.of(found.normal.sum(axis=2), shared)
     for k in range(4):
         dense = least_squares(problem, data.rows(slice(k, k + 1)))
         assert dense.converged
@@ -134,8 +137,9 @@ def test_the_minimum_is_that_of_full_precision(errors_in_variables, transient, r
         assert found.cost[k] == pytest.approx(dense.cost, rel=1e-4)
         assert np.abs(found.residual[k] - dense.turned).max() < 1e-2
         size = np.sqrt(np.outer(*2 * [np.diag(covariance)[:shared]]))
-        assert np.abs((inverse.shared[k] - covariance[:shared, :shared]) / size).max() < 0.05
-        assert 1 / 3 < inverse.condition[k] / condition < 15
+        marginal = found.marginal[k, 0, :shared, :shared]
+        assert np.abs((marginal - covariance[:shared, :shared]) / size).max() < 0.05
+        assert 1 / 3 < found.condition[k] / condition < 15
 
 
 @pytest.mark.parametrize("records", [1, 3])
@@ -143,24 +147,26 @@ def test_points_that_steps_lost_are_found_at_full_precision(records):
     """Searches ended at once, all or some of a batch: what comes back is what they would have found."""
     problem, data = problem_and_data(5, records, False, True)
     found = minimise(problem, data)
-    lost = minimise(problem, data, max_iterations=0)
+    lost = minimise(problem, data, None, RULES._replace(iterations=0))
     assert found.converged.all()
     assert not lost.converged.any()
-    assert_same(refit_failed(problem, lost, data), found)
     some = dataclasses.replace(found, converged=np.arange(5) != 2, theta=found.theta.copy())
     some.theta[2] = lost.theta[2]
-    assert_same(refit_failed(problem, some, data), found)
+    refit_failed(problem, lost, data)
+    assert_same(lost, found)
+    refit_failed(problem, some, data)
+    assert_same(some, found)
 
 
 def assert_same(solution, other):
     """To a hundredth of a standard deviation; sums and residuals accordingly."""
     assert solution.converged.all()
-    square = other.normal.sum(axis=2)
-    moved = solution.theta - other.theta
-    assert np.einsum("...i,...ij,...j->...", moved, square, moved).max() < 1e-3
-    size = np.sqrt(np.einsum("...ii->...i", square))
-    scale = size[..., None, :, None] * size[..., None, None, :]
-    assert np.abs((solution.normal - other.normal) / scale).max() < 1e-2
+    size = np.sqrt(np.einsum("...ii->...i", other.marginal))
+    assert np.abs((solution.theta - other.theta) / size).max() < 1e-2
+    scale = size[..., :, None] * size[..., None, :]
+    assert np.abs((solution.marginal - other.marginal) / scale).max() < 1e-2
+    assert solution.condition == pytest.approx(other.condition, rel=1e-2)
+    assert solution.leverage == pytest.approx(other.leverage, abs=1e-2)
     assert solution.cost == pytest.approx(other.cost, rel=1e-4)
     assert solution.part_cost == pytest.approx(other.part_cost, rel=1e-3)
     assert np.abs(solution.residual - other.residual).max() < 2e-2
@@ -244,11 +250,12 @@ def test_every_length_of_numerators(terms, numerator_order):
     plan = plan_of(8, ModelStructure(2, numerator_order), transient_terms=terms)
     plant = Plant(0.02, 10.0, 8)
     u, y = points_of(plant)
-    one = np.ones((POINTS, 1, 1)) * plant.noise[0]
+    one = np.full((POINTS, 1), plant.noise[0])
     data = BinData.of(
-        y[:, None], u[:, None], plan.other_bins.size, one, None, None, one, order=plan.order
+        y[:, None], u[:, None], plan.order, plan.other_bins.size, rest=one, variance_y=one
     )
-    found = refit_failed(plan.problem, minimise(plan.problem, data), data)
+    found = minimise(plan.problem, data)
+    refit_failed(plan.problem, found, data)
     for k in range(3):
         dense = least_squares(plan.problem, data.rows(slice(k, k + 1)))
         std = np.sqrt(0.5 * np.diag(dense.covariance()[0]))

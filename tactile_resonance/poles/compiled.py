@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What fits call in compiled form, and how it is compiled: by numba, into its cache, once per installation.
+
+numba keeps the machine code beside each source, or in its own cache directory (NUMBA_CACHE_DIR). It looks at
+the date of that one file: functions that are compiled call none of other files.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from numba.core import event
+
+OPTIONS: dict[str, Any] = {
+    "cache": True,
+    # Sums may be reordered, else no loop that adds up uses vector instructions; NaN and infinity keep
+    # their meaning.
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+    # A division by zero is infinite, as in numpy, and not an exception that every loop would test for.
+    "error_model": "numpy",
+}
+
+KERNELS: list[Any] = []
+"""Those that Python calls."""
+
+inner = njit(**OPTIONS)
+"""A function that other compiled ones call."""
+
+
+def entry(function: Callable) -> Callable:
+    """A compiled function that Python calls.
+
+    It sees one kind of arrays, contiguous and writable, whatever it is given, so that it is compiled once.
+    """
+    kernel = inner(function)
+    KERNELS.append(kernel)
+
+    @wraps(function)
+    def call(*arguments):
+        return kernel(*[_plain(x) if type(x) is np.ndarray else x for x in arguments])
+
+    return call
+
+
+def _plain(array: npt.NDArray) -> npt.NDArray:
+    """`numpy.require` takes a microsecond to see that nothing is to be done."""
+    flags = array.flags
+    return array if flags.c_contiguous and flags.writeable else np.array(array, order="C")
+
+
+REHEARSALS: list[Callable[[], object]] = []
+
+
+def rehearsal(call: Callable[[], object]) -> Callable[[], object]:
+    """Mark a function that calls the compiled functions of its module, each once, on a little data."""
+    REHEARSALS.append(call)
+    return call
+
+
+@cache
+def compiled() -> int:
+    """How many functions were not in the cache and had to be compiled, of those that fits call.
+
+    About a minute of work, once per installation, which the log says before it begins.
+    """
+    import tactile_resonance.poles.identify
+    import tactile_resonance.poles.joint  # noqa: F401 - with all that these use
+
+    with event.install_listener("numba:compile", _Notice()):
+        for call in REHEARSALS:
+            call()
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in KERNELS)
+
+
+class _Notice(event.Listener):
+    """Says on the log that kernels are compiled, as the first of them begins."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: object) -> None:
+        """Say it once."""
+        if not self._said:
+            logging.getLogger(__name__).warning(
+                "compiling the pole fits, once per installation: about a minute; ahead of the first use: "
+                "tactile_resonance compile"
+            )
+        self._said = True
+
+    def on_end(self, event: object) -> None:
+        """Nothing to say."""
