@@ -101,8 +101,8 @@ class Sphere:
     def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie inside or on the surface."""
         position = _coordinates(position_m, 3)
-        way = position - np.asarray(self.center_m)
-        return np.asarray(np.einsum("...i,...i", way, way) <= self.radius_m**2)
+        x, y, z = np.moveaxis(position - np.asarray(self.center_m), -1, 0)
+        return np.asarray(x * x + y * y + z * z <= self.radius_m**2)
 
 
 Shape = Disc | Box | HalfSpace | Sphere
@@ -176,10 +176,12 @@ def energy_density(radial: ArrayLike, depth: ArrayLike) -> FloatArray:
 
 @lru_cache(maxsize=1)
 def energy_nodes() -> tuple[FloatArray, FloatArray]:
-    """Return points (N, 3) below the contact, in contact radii, and their energies (N,), sum 1.
+    """Return points (k, n, 3) below the contact, in contact radii, and their energies (k, n), sum 1.
 
     Products of Gauss-Legendre rules in distance and polar angle, turned about the normal by the
     golden angle from one to the next, so that no plane of symmetry meets many points at once.
+    A simulated robot asks for them as it moves, so they lie coordinate by coordinate, in parts of 100 kB: what
+    is computed of larger ones gets its memory from the system each time, which takes longer than a step.
     """
     s, ws = np.polynomial.legendre.leggauss(64)
     t, wt = np.polynomial.legendre.leggauss(32)
@@ -194,15 +196,15 @@ def energy_nodes() -> tuple[FloatArray, FloatArray]:
     )
     turn = np.arange(radial.size).reshape(radial.shape) * np.pi * (3 - np.sqrt(5))
     phi = turn[..., None] + 2 * np.pi / azimuths * np.arange(azimuths)  # (s, t, azimuths)
-    points = np.stack(
+    coordinates = np.stack(
         [
             radial[..., None] * np.cos(phi),
             radial[..., None] * np.sin(phi),
             np.broadcast_to(-depth[..., None], phi.shape),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    weights = np.broadcast_to(weight[..., None], phi.shape).ravel()
+        ]
+    ).reshape(3, -1, 4096)
+    points = np.ascontiguousarray(coordinates.swapaxes(0, 1)).swapaxes(1, 2)
+    weights = np.broadcast_to(weight[..., None], phi.shape).reshape(-1, 4096)
     return points, weights / weights.sum()
 
 
@@ -217,8 +219,9 @@ def energy_share(shape: Shape, surface_point_m: ArrayLike, contact_radius_m: flo
     contact_radius_m : float
     """
     points, weights = energy_nodes()
-    inside = shape.contains(np.asarray(surface_point_m) + contact_radius_m * points)
-    return float(weights[inside].sum())
+    at_m = np.asarray(surface_point_m)
+    inside = [shape.contains(at_m + contact_radius_m * part) for part in points]
+    return float(weights[np.array(inside)].sum())
 
 
 @dataclass(frozen=True)
