@@ -70,7 +70,7 @@ class Part:
     drawn_ms : tuple of float
         Processor time of one cloud, one array of markers, one surface [ms].
     memory_mb, map_mb : float
-        Resident at its end [MB]: of the scan, and of the process with the map before it is drawn.
+        Resident at its end [MB]: of the scan, and of the process with the map, once it is drawn.
     files : int
         Open at its end.
     """
@@ -134,8 +134,7 @@ def map_node(pipe: Connection) -> None:
             grown.take(from_message(message_types().deserialize_cdr(cdr, TYPE)))
             times_ms.append(1e3 * (time.process_time() - begun_s))
             continue
-        held_mb = memory_mb()
-        pipe.send((float(np.median(times_ms)), tuple(drawn_ms(grown.map)), held_mb))
+        pipe.send((float(np.median(times_ms)), tuple(drawn_ms(grown.map)), memory_mb()))
         times_ms.clear()
 
 

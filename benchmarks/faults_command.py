@@ -30,7 +30,7 @@ from benchmarks.load_case import descendants, runs
 from tactile_resonance.processes import end_with_parent, free_domain_id
 from tactile_resonance.scan.run_content import read_run
 
-POINTS = 2
+POINTS, LONGER_POINTS = 2, 14
 WITHIN_S = 600.0
 DISK = "64m"
 STEP_S = 3600.0
@@ -151,12 +151,12 @@ def _ended(pid: int) -> bool:
 
 
 class Scene:
-    """Where a row works, and what it begins there."""
+    """Where a row works, and what it begins there: a scan of `points`."""
 
-    def __init__(self, folder: Path, host: str) -> None:
-        self.host = host
+    def __init__(self, folder: Path, host: str, points: int = POINTS) -> None:
+        self.host, self.points = host, points
         self.file, self.run = folder / "scene.yaml", folder / "run"
-        self.file.write_text(SCENE.format(size_x=0.003 * (POINTS - 1), size_y=0.0, blocks=BLOCKS))
+        self.file.write_text(SCENE.format(size_x=0.003 * (points - 1), size_y=0.0, blocks=BLOCKS))
 
     def demo(self, **how: object) -> Command:
         """Begin it."""
@@ -205,7 +205,7 @@ class Scene:
         else:
             happened = "finishes"
         command.close()
-        found += what_is_wrong(read_run(self.run), range(POINTS), force_n)
+        found += what_is_wrong(read_run(self.run), range(self.points), force_n)
         happened = happened.replace(str(self.run), "RUN")
         return Row(name, happened, way_on, told_s, ended_s, force_n, "; ".join(found))
 
@@ -312,7 +312,8 @@ def _two_demos(scene: Scene) -> Row:
 
 
 def _domain_in_use(scene: Scene) -> Row:
-    """A second demo in the domain of the first one, at another address."""
+    """A second demo in the domain of the first one, at another address; the first one shall last longer."""
+    scene = Scene(scene.file.parent, scene.host, LONGER_POINTS)
     first = scene.demo()
     first.until(first.measures)
     begun_s = time.monotonic()
