@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -113,10 +114,15 @@ class Adaptive:
     most: int
     wanted: WantedBoundary | WantedMap
 
-    @property
+    @cached_property
     def raster(self) -> Raster:
         """Of the region, fine enough for areas."""
         return self._raster(CELLS)
+
+    @cached_property
+    def _coarse(self) -> Raster:
+        """Of the region, for what a touch gains."""
+        return self._raster(CELLS // 2)
 
     def _raster(self, cells: int) -> Raster:
         longest_m = float(np.max(np.ptp(self.polygon_m, axis=0)))
@@ -208,8 +214,7 @@ class Adaptive:
         noise_hz: float,
     ) -> FloatArray:
         """(f,) loss that a touch at each free place is expected to take away, summed over the region."""
-        raster = self._raster(CELLS // 2)
-        at = raster.xy_m[raster.within]
+        at = self._coarse.xy_m[self._coarse.within]
         f0_hz, std_hz = surface.predict(at)
         before = self.wanted.loss(f0_hz, std_hz)
         open_ = before > _OPEN * before.max()

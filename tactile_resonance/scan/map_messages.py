@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 from tactile_resonance.recording.messages import POLES_STATUS, write_header
 from tactile_resonance.scan.level_set import LevelSet
 from tactile_resonance.scan.messages import make_message, message_types
@@ -250,10 +250,10 @@ def _lay(marker: Message, positions_m: FloatArray, share: FloatArray, alpha: flo
 def _points(positions: FloatArray) -> list[Message]:
     """Of places (n, 3)."""
     make = message_types().types["geometry_msgs/msg/Point"]
-    return [make(*place) for place in positions.tolist()]
+    return [*map(make, *positions.T.tolist())]
 
 
 def _colours(rgb: npt.ArrayLike, alpha: float = 1.0) -> list[Message]:
     """Of red, green and blue (n, 3)."""
     make = message_types().types["std_msgs/msg/ColorRGBA"]
-    return [make(*each, alpha) for each in np.asarray(rgb, float).tolist()]
+    return [make(*each, alpha) for each in zip(*np.asarray(rgb, float).T.tolist(), strict=True)]
