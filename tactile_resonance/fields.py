@@ -88,6 +88,11 @@ def cut(text: str) -> str:
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 3]}..."
 
 
+def counted(count: int, thing: str, plural: str = "") -> str:
+    """``1 point``, ``3 points``; with a plural of its own where that is not the thing and an s."""
+    return f"{count} {thing}" if count == 1 else f"{count} {plural or thing + 's'}"
+
+
 def read_file_name(value: object, field: str) -> str:
     """Return `value` as a name that a file may have; ``ValueError`` if it is not."""
     good = isinstance(value, str) and 0 < len(value) <= LONGEST and value.isprintable()

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a record without drive holds: tones and noise of both channels."""
+"""What a record without drive holds: tones and noise of both channels.
+
+Apart from `tones`, which nodes load: SciPy's windows and peaks take half a second.
+"""
 
 from __future__ import annotations
 

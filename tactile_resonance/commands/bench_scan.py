@@ -19,8 +19,7 @@ from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.calibration.file import read_calibration
 from tactile_resonance.commands.options import ProgressBar, add_file, require_packages
-from tactile_resonance.counted import counted
-from tactile_resonance.fields import require
+from tactile_resonance.fields import counted, require
 from tactile_resonance.processes import (
     ENDING,
     NodeProcesses,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_resonance.commands.options import add_file, add_runs
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 from tactile_resonance.files import csv_text, write_whole
 
 if TYPE_CHECKING:

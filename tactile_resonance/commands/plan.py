@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_resonance.commands.options import add_file
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,8 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tactile_resonance.commands.options import ProgressBar, add_band, add_runs, check_output
-from tactile_resonance.counted import counted
-from tactile_resonance.fields import band, require
+from tactile_resonance.fields import band, counted, require
 from tactile_resonance.poles.structure import ModelStructure
 
 

@@ -12,13 +12,13 @@ from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.counted import counted
 from tactile_resonance.drivers.acquisition import (
     AcquiredBlock,
     AcquisitionDevice,
     DeviceError,
     DeviceInfo,
 )
+from tactile_resonance.fields import counted
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import contact_source, devices, excitation_design
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 from tactile_resonance.report.run_report import scene_of
 from tactile_resonance.scan.adaptive import Adaptive, known_points
 from tactile_resonance.scan.level_set import Boundary, Lines, difference_m2

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 from tactile_resonance.report import run_tables as tables
 from tactile_resonance.report.drawing import SIMULATED
 from tactile_resonance.report.page import map_entry, page, page_data, point_entry

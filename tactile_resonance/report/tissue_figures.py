@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.report.drawing import SIMULATED, draw_ellipse, new_figure
 from tactile_resonance.scan.tissue_tests import TissueTest

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.counted import counted
-from tactile_resonance.fields import check_above_zero, require
+from tactile_resonance.fields import check_above_zero, counted, require
 from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
 from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal

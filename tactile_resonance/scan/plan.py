@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 from tactile_resonance.scan.adaptive import known_points
 from tactile_resonance.scan.clearance import TipUse, clear_points, is_along, is_plane
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tactile_resonance.contact.force_spread import SHORTEST_S
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.decision import Precise, Separate
 from tactile_resonance.scan.measurement import CALIBRATED_S, MeasurementDesign, design_measurement

@@ -26,8 +26,7 @@ from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from rosbags.serde import SerdeError
 
-from tactile_resonance.counted import counted
-from tactile_resonance.fields import read_dataclass
+from tactile_resonance.fields import counted, read_dataclass
 from tactile_resonance.files import write_whole
 from tactile_resonance.scan.messages import definition_and_hash, message_types
 from tactile_resonance.scan.point_file import (

@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.interfaces import Qos
 
-from tactile_resonance.counted import counted
+from tactile_resonance.fields import counted
 from tactile_resonance.files import sync, write_whole
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.messages import definition_and_hash, message_types
