@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.poles.whiteness import whiteness
+
+if TYPE_CHECKING:  # compiled, which nodes that only pass poles on need not wait for
+    from tactile_resonance.poles.model import RationalModel
 
 
 class PolesStatus(Enum):
@@ -274,6 +276,8 @@ class PolesBatch:
     @property
     def whiteness(self) -> FloatArray:
         """(...) how much smoother the residuals are than white ones; see `whiteness.whiteness`."""
+        from tactile_resonance.poles.whiteness import whiteness  # compiled, too
+
         return whiteness(self.residual, self.structure.parameters)
 
     def has_status(self, status: PolesStatus) -> BoolArray:
