@@ -7,18 +7,19 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from tactile_resonance.contact.samples import Pose
-from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.poles.result import Poles
-from tactile_resonance.record import Origin
-from tactile_resonance.scan.clearance import Standoffs
-from tactile_resonance.scan.measurement import MeasurementDesign
-from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.run_directory import PointRecording
-from tactile_resonance.scan.scene import Hold
-from tactile_resonance.scan.tissue_tests import ProtocolRequest
+if TYPE_CHECKING:  # nodes that take goals need what may go wrong, and load nothing of scenes and runs for it
+    from tactile_resonance.contact.samples import Pose
+    from tactile_resonance.frf.result import BandDistortion
+    from tactile_resonance.poles.result import Poles
+    from tactile_resonance.record import Origin
+    from tactile_resonance.scan.clearance import Standoffs
+    from tactile_resonance.scan.measurement import MeasurementDesign
+    from tactile_resonance.scan.points import ScanPoint
+    from tactile_resonance.scan.run_directory import PointRecording
+    from tactile_resonance.scan.scene import Hold
+    from tactile_resonance.scan.tissue_tests import ProtocolRequest
 
 ATTEMPTS = 6  # at what is disturbed: a point, a reference, a touch
 # A point that lost its node is repeated when the node is back, so often at most: it may be what ends the node.

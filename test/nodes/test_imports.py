@@ -40,3 +40,9 @@ def test_nodes_of_the_hardware_load_nothing_of_the_simulation():
     found = loaded_by(HARDWARE)
     assert "tactile_resonance.sensor" in found
     assert not [name for name in found if name.startswith("tactile_resonance.simulation")]
+
+
+def test_what_plays_and_measures_loads_nothing_of_scenes_and_runs():
+    found = loaded_by(("excitation_node", "frf_node", "poles_node", "contact_node"))
+    assert "tactile_resonance.nodes.goals" in found
+    assert found.isdisjoint({f"tactile_resonance.scan.{name}" for name in ("scene", "plan", "run_content")})
