@@ -278,11 +278,11 @@ def _page(
                 "Simulated, in virtual time: the runner, the folder and the estimator in one process, as "
                 "scan_node, frf_node and poles_node use them, and the map in another, as in pole_map_node; "
                 "no robot, no nodes (those: [on the wall clock](endurance_hour.md)). Medians over each "
-                "tenth of processor times, which other work on the machine changes little, and of its "
-                "clock, which it does change. Summaries are the row of `results.csv` and, after each "
-                "twentieth of the points, the bag's metadata: their mean. Map: what a map node does with "
-                "each result. It draws the messages (cloud, markers, surface) only where "
-                "somebody listens, and for at most a tenth of its time.",
+                "tenth of processor times, which other work on the machine changes less than those of its "
+                "clock. Memory of the map's process is that once all is drawn. Summaries are the row of "
+                "`results.csv` and, after each twentieth of the points, the bag's metadata: their mean. "
+                "Map: what a map node does with each result. It draws the messages (cloud, markers, "
+                "surface) only where somebody listens, and for at most a tenth of its time.",
                 112,
             ),
             "",
