@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a scan takes of the processors on the wall clock, process by process.
 
-The nodes of `tactile_resonance scan --real-time` with a simulated robot and load cell: nothing under
-way, a contact of 1 cN held, a scan, and two scans at once, each with nodes and a robot of its own.
+The nodes of `tactile_resonance scan --real-time` with a simulated robot and load cell: nothing under way,
+from 5 s after they came up; a contact of 1 cN held; a scan; two scans at once, each with nodes and a robot
+of its own.
 Shares are the processor time of all threads of a process over time: of one core. Other work of the
-machine makes them larger, by what it takes of caches and clock, and the loop slower by as much.
+machine makes them larger, by what it takes of caches and clock, and the loop slower by as much. A virtual
+machine whose host stands it still for 10 ms and more loses contacts by that: forces are stale then.
 """
 
 from __future__ import annotations
@@ -151,7 +153,7 @@ def _report(
     for name, scan in zip(("One scan", "Of two, the first", "the second"), scans, strict=True):
         lines.append(
             f"- {name}: {scan.done} of {scan.points} points with poles in {scan.duration_s:.0f} s, "
-            f"{scan.repeats} repeats; the simulation stood still for more than 10 ms {scan.stalls} times."
+            f"{scan.repeats}; the simulation stood still for more than 10 ms {scan.stalls} times."
         )
     ratio = GOAL_LOOP_S / loop
     busy = [name for name in shares if name != "idle"]

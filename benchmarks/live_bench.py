@@ -24,7 +24,9 @@ from tactile_resonance.nodes.client import NoAnswer, ScanClient
 from tactile_resonance.nodes.goals import Goals
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.report.run_tables import repeats_sentence
 from tactile_resonance.scan.hands import NodeAway
+from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ UP_WITHIN_S = 120.0
 CONTACT_WITHIN_S = 30.0
 SCAN_WITHIN_S = 600.0
 HOLD_TRIES = 5
+SETTLED_S = 5.0
 LOOK_EVERY_S = 0.5
 CHILDREN = {"contact_node": "ur_client", "fake_hardware_node": "simulate-ur"}
 """The process that a node starts."""
@@ -53,17 +56,18 @@ class LiveScan:
         Of one core, by process, from the first point's beginning to the scan's end.
     duration_s : float
         Of that.
-    points, done, repeats, stalls : int
-        Points of the plan; those with poles; repeats of points; how often the simulation
-        stood still for more than 10 ms.
+    points, done, stalls : int
+        Points of the plan; those with poles; how often the simulation stood still for more than 10 ms.
+    repeats : str
+        How often points were repeated, and why.
     """
 
     shares: Shares
     duration_s: float
     points: int
     done: int
-    repeats: int
     stalls: int
+    repeats: str
 
 
 class LiveClient(ScanClient):
@@ -143,8 +147,9 @@ class LiveBench:
         self._nodes.stop()
 
     def idle(self, seconds: float) -> Shares:
-        """Shares while nothing is under way."""
+        """Shares while nothing is under way, once all that came up knows each other."""
         self.client.rest()
+        self._spin(SETTLED_S)
         return self._over(lambda: self._spin(seconds))
 
     def holding(self, seconds: float) -> tuple[Shares, int]:
@@ -183,8 +188,8 @@ class LiveBench:
             time.monotonic() - begun_s,
             result.points,
             result.done,
-            result.repeats,
             int(self.client.details("fake_hardware_node").get("simulator stalls", 0)),
+            repeats_sentence(read_run(self._job.output).latest),
         )
 
     def _over(self, work: Callable[[], None]) -> Shares:
