@@ -155,6 +155,8 @@ def assemble(
     poles = quantities["poles_rad_s"]
     significant = significant_modes(model, quantities, covariance, judged.lines)
     significant &= ~judged.dispensable
+    if poles.shape[-1] > 2:
+        significant &= ~_sum_of_hidden(poles, significant)
     code = np.full(hopeless.shape, STATUS_CODE[PolesStatus.OK], np.uint8)
     with np.errstate(invalid="ignore"):
         # the gravest last, so that it stays
@@ -208,3 +210,14 @@ def _lost_to_rounding(covariance: FloatArray) -> BoolArray:
     """
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     return np.asarray((variances <= 0).any(axis=(-2, -1)))
+
+
+def _sum_of_hidden(poles: ComplexArray, significant: BoolArray) -> BoolArray:
+    """(batch, k) wide modes across two others or more of which none is significant alone.
+
+    Noise hides each of these, but not their sum, which a mode as wide as all of them stands for.
+    """
+    apart = np.abs(poles.imag[:, :, None] - poles.imag[:, None, :])
+    across = (apart < np.abs(poles.real)[:, :, None]) & ~np.eye(poles.shape[-1], dtype=bool)
+    some = (across & significant[:, None, :]).any(axis=-1)
+    return np.asarray((across.sum(axis=-1) > 1) & ~some)
