@@ -35,8 +35,7 @@ from tactile_resonance.drivers.force_sources import force_source
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.processes import may_take_priority, take_priority
-from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.plant.simulated_robot import order
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE, order
 
 HOST = "127.0.13.77"
 PRIORITY = 20

@@ -23,7 +23,7 @@ from tactile_resonance.processes import end_with_parent
 from tactile_resonance.report.point_details import deviations, truths_of
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import RunContent, read_run
-from tactile_resonance.simulation.plant.simulated_robot import order
+from tactile_resonance.simulation.plant.defaults import order
 
 HUNG_AFTER_S = 20.0
 """In place of the 60 s of `hung_after_s`: what is waited for so long ends sooner, all else is the same."""

@@ -22,7 +22,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import ArmError
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.simulation.plant.simulated_robot import order
+from tactile_resonance.simulation.plant.defaults import order
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 HOST = "127.0.77.1"

@@ -23,7 +23,7 @@ from tactile_resonance.clock import PORT
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.processes import NodeProcesses, free_domain_id
 from tactile_resonance.simulation.plant.bench_time import START_NS
-from tactile_resonance.simulation.plant.simulated_robot import order
+from tactile_resonance.simulation.plant.defaults import order
 
 HOST = "127.0.13.78"
 STEP_M = 0.006  # between contacts: fresh tissue

@@ -6,7 +6,7 @@ import socket
 import time
 
 from tactile_resonance.clock import PORT as TIME_PORT
-from tactile_resonance.simulation.plant.simulated_robot import order
+from tactile_resonance.simulation.plant.defaults import order
 
 PATIENCE_S = 60.0
 

@@ -170,7 +170,8 @@ def _tabletop(options: argparse.Namespace) -> Tabletop:
     from tactile_resonance.contact.interfaces import Mount
     from tactile_resonance.contact.samples import Pose
     from tactile_resonance.sensor import read_sensor
-    from tactile_resonance.simulation.plant.tabletop import BenchSetup, LaidScene, Tabletop
+    from tactile_resonance.simulation.plant.surfaces import LaidScene
+    from tactile_resonance.simulation.plant.tabletop import BenchSetup, Tabletop
     from tactile_resonance.simulation.tissue.library import read_tissues
     from tactile_resonance.simulation.tissue.scene import read_scene
 

@@ -23,8 +23,7 @@ from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.processes import may_take_priority, start_child
 from tactile_resonance.record import Origin, Record
 from tactile_resonance.simulation.plant.bench_time import BenchTime
-from tactile_resonance.simulation.plant.defaults import PRIORITY, READY
-from tactile_resonance.simulation.plant.simulated_robot import order
+from tactile_resonance.simulation.plant.defaults import PRIORITY, READY, order
 from tactile_resonance.simulation.ur5e.reactor import Reactor
 
 START_WITHIN_S = 90.0

@@ -30,7 +30,7 @@ from tactile_resonance.recording.messages import (
     fill_complex,
     time_from_message,
 )
-from tactile_resonance.simulation.plant.tabletop import LaidScene
+from tactile_resonance.simulation.plant.surfaces import LaidScene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, parts_of
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactState

@@ -33,7 +33,7 @@ from tactile_resonance.nodes.running import STREAM, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.plant.tabletop import LaidScene
+from tactile_resonance.simulation.plant.surfaces import LaidScene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip
 

@@ -46,3 +46,9 @@ def test_what_plays_and_measures_loads_nothing_of_scenes_and_runs():
     found = loaded_by(("excitation_node", "frf_node", "poles_node", "contact_node"))
     assert "tactile_resonance.nodes.goals" in found
     assert found.isdisjoint({f"tactile_resonance.scan.{name}" for name in ("scene", "plan", "run_content")})
+
+
+def test_the_bench_loads_nothing_of_the_robot_that_it_starts():
+    found = loaded_by(("fake_hardware_node",))
+    assert "tactile_resonance.simulation.sensor.bench" in found
+    assert found.isdisjoint({"numba", "tactile_resonance.simulation.plant.simulated_robot"})

@@ -11,7 +11,6 @@ from __future__ import annotations
 import gc
 import json
 import re
-import socket
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -19,13 +18,12 @@ from typing import Any
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.fields import number
 from tactile_resonance.simulation.plant.bench_time import BenchTime
+from tactile_resonance.simulation.plant.defaults import CONTROL_PORT
 from tactile_resonance.simulation.ur5e import dashboard, rtde_server
 from tactile_resonance.simulation.ur5e.controller import UrController
 from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService, Reactor
 from tactile_resonance.simulation.ur5e.safety import RefusedError
 from tactile_resonance.simulation.ur5e.target import CYCLE_S
-
-CONTROL_PORT = 30020
 
 
 class ControlService(MessageService):
@@ -58,30 +56,6 @@ class ControlService(MessageService):
             return {"ok": False, "error": "request: nested too deeply"}
         except ValueError as error:
             return {"ok": False, "error": str(error)}
-
-
-def order(
-    host: str, command: str, port: int = CONTROL_PORT, timeout_s: float = 5.0, **fields: Any
-) -> dict:
-    """Send one command to a simulated robot and return its answer.
-
-    Raises
-    ------
-    ValueError
-        Where the robot refuses it.
-    OSError
-        Where nothing listens or answers in time.
-    """
-    with socket.create_connection((host, port), timeout_s) as channel:
-        channel.sendall(json.dumps({"command": command, **fields}).encode() + b"\n")
-        with channel.makefile() as lines:
-            line = lines.readline()
-    if not line:
-        raise ConnectionError(f"control port {port} of {host}: closed without an answer")
-    answer = json.loads(line)
-    if not answer.pop("ok"):
-        raise ValueError(answer["error"])
-    return answer
 
 
 # Programs come in here, nothing goes out: a real controller also sends its state, which no client of this

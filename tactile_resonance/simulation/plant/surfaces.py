@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Surfaces of what lies on the simulated table (flat, a sphere, a hollow), and how living tissue moves them."""
+"""What lies on the simulated table: surfaces (flat, a sphere, a hollow), a scene; how living tissue moves."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Vector, difference, dot, vector
 from tactile_resonance.fields import check_not_negative, check_within, require
+
+if TYPE_CHECKING:
+    from tactile_resonance.contact.samples import Pose
+    from tactile_resonance.simulation.tissue.hertz import Tissue
+    from tactile_resonance.simulation.tissue.scene import PhantomScene
 
 
 class PlantSurface(Protocol):
@@ -171,3 +176,31 @@ class SurfaceMotion:
         heart += 2 * math.pi * self.heart_hz * time_s
         rise = self.breath_m * math.cos(breath) ** (2 * self.breath_power)
         return rise + self.heart_m / 2 * math.sin(heart)
+
+
+@dataclass(frozen=True)
+class LaidScene:
+    """A scene on the table: its surface, at height 0, and what lies where.
+
+    Attributes
+    ----------
+    scene : PhantomScene
+    table : Pose
+        Frame of the scene in the robot's base.
+    """
+
+    scene: PhantomScene
+    table: Pose
+
+    def surface(self) -> FlatSurface:
+        """The undisturbed surface in the base."""
+        return FlatSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
+
+    def on_table(self, position_m: FloatArray) -> FloatArray:
+        """Point (3,) of the surface in the scene's frame, under a place (3,) in the base."""
+        place = self.table.rotation.inv().apply(position_m - self.table.position_m)
+        return np.array([place[0], place[1], 0.0])
+
+    def tissue_at(self, position_m: FloatArray) -> Tissue | None:
+        """What the tip touches under a place (3,) in the base."""
+        return self.scene.tissue_at(self.on_table(position_m))

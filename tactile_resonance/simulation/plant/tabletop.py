@@ -26,12 +26,11 @@ from tactile_resonance.simulation.cell.load_cell import LoadCell
 from tactile_resonance.simulation.cell.tcp_bus import TcpBus
 from tactile_resonance.simulation.plant.plant import CellMounting, Plant
 from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
-from tactile_resonance.simulation.plant.surfaces import FlatSurface, SurfaceMotion
+from tactile_resonance.simulation.plant.surfaces import FlatSurface, LaidScene, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import TissueLibrary
-from tactile_resonance.simulation.tissue.scene import PhantomScene
 
 KEEP_STEPS = 30_000
 """A minute at 500 Hz."""
@@ -153,34 +152,6 @@ class BenchSetup:
         require(-1 <= height <= 1, "surface_height_m", height, "-1 to 1")
         require(abs(self.tilt_rad) <= 0.35, "tilt_rad", self.tilt_rad, "-0.35 to 0.35 (20 degrees)")
         require(math.isfinite(self.azimuth_rad), "azimuth_rad", self.azimuth_rad, "a number")
-
-
-@dataclass(frozen=True)
-class LaidScene:
-    """A scene on the table: its surface, at height 0, and what lies where.
-
-    Attributes
-    ----------
-    scene : PhantomScene
-    table : Pose
-        Frame of the scene in the robot's base.
-    """
-
-    scene: PhantomScene
-    table: Pose
-
-    def surface(self) -> FlatSurface:
-        """The undisturbed surface in the base."""
-        return FlatSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
-
-    def on_table(self, position_m: FloatArray) -> FloatArray:
-        """Point (3,) of the surface in the scene's frame, under a place (3,) in the base."""
-        place = self.table.rotation.inv().apply(position_m - self.table.position_m)
-        return np.array([place[0], place[1], 0.0])
-
-    def tissue_at(self, position_m: FloatArray) -> Tissue | None:
-        """What the tip touches under a place (3,) in the base."""
-        return self.scene.tissue_at(self.on_table(position_m))
 
 
 class Tabletop:

@@ -13,7 +13,7 @@ import rtde_control
 import rtde_io
 from clients import Clients, near, same_pose, slope
 
-from tactile_resonance.simulation.plant.simulated_robot import order
+from tactile_resonance.simulation.plant.defaults import order
 
 FLAGS = rtde_control.RTDEControlInterface
 UPLOAD = FLAGS.FLAG_UPLOAD_SCRIPT

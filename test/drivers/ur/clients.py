@@ -10,7 +10,7 @@ import rtde_receive
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.clock import PORT, Demand, SimulatedClock
-from tactile_resonance.simulation.plant.simulated_robot import order
+from tactile_resonance.simulation.plant.defaults import order
 
 PATIENCE_S = 60.0
 CYCLE_S = 0.002

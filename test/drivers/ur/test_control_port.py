@@ -8,7 +8,7 @@ import time
 import pytest
 
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.plant.simulated_robot import CONTROL_PORT
+from tactile_resonance.simulation.plant.defaults import CONTROL_PORT
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 

@@ -7,8 +7,8 @@ import pytest
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.plant import Plant
-from tactile_resonance.simulation.plant.surfaces import FlatSurface, SurfaceMotion
-from tactile_resonance.simulation.plant.tabletop import BenchSetup, LaidScene, Tabletop
+from tactile_resonance.simulation.plant.surfaces import FlatSurface, LaidScene, SurfaceMotion
+from tactile_resonance.simulation.plant.tabletop import BenchSetup, Tabletop
 from tactile_resonance.simulation.plant.tip import RigidTip
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
