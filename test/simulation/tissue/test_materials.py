@@ -2,6 +2,7 @@
 """Gradients, random heterogeneity, and what lies under the surface; the map of their truth."""
 
 import itertools
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,20 @@ def test_energy_shares_add_up_and_do_not_depend_on_direction():
         for t in np.linspace(0, 6, 13)
     ]
     assert np.ptp(around) < 0.03 * np.mean(around)
+
+
+def test_what_is_buried_is_found_with_little_memory():
+    """A simulated robot asks for it as it moves: memory from the system takes longer than one of its steps."""
+    inclusion = Sphere((2e-3, -1e-3, -0.0122), 0.012)
+    energy_share(inclusion, (0, 0, 0), 1e-3)  # computes the points
+    tracemalloc.start()
+    try:
+        share = energy_share(inclusion, (1e-3, 0, 0), 1e-3)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert 0.1 < share < 0.9
+    assert peak_bytes < 1 << 20
 
 
 @pytest.mark.parametrize("depth", [0.3, 1.0, 3.0, 10.0])
