@@ -37,6 +37,7 @@ UP_WITHIN_S = 120.0
 CONTACT_WITHIN_S = 30.0
 SCAN_WITHIN_S = 600.0
 HOLD_TRIES = 5
+RETRACT_TRIES, RETRACT_S = 20, 1.0
 SETTLED_S = 5.0
 LOOK_EVERY_S = 0.5
 CHILDREN = {"contact_node": "ur_client", "fake_hardware_node": "simulate-ur"}
@@ -91,10 +92,17 @@ class LiveClient(ScanClient):
             return False
 
     def draw_back(self) -> None:
-        """End a contact, however it stands."""
-        self.wait(self._retract.service_is_ready, CONTACT_WITHIN_S, "retract")
-        future = self._retract.call_async(Trigger.Request())
-        self.wait(future.done, CONTACT_WITHIN_S, "an answer to retract")
+        """End a contact, however it stands: again where that is disturbed, too."""
+        fault = msg.ContactState.STATE_FAULT
+        for _ in range(RETRACT_TRIES):
+            self.wait(self._retract.service_is_ready, CONTACT_WITHIN_S, "retract")
+            future = self._retract.call_async(Trigger.Request())
+            self.wait(future.done, CONTACT_WITHIN_S, "an answer to retract")
+            end_s = time.monotonic() + RETRACT_S
+            while time.monotonic() < end_s:
+                self.spin(0.1)
+            if self.contact_state != fault:
+                break
         self.rest()
 
     def rest(self) -> None:
