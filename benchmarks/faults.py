@@ -39,7 +39,7 @@ load cell and sensor; nothing here is a measurement on hardware, and what a robo
 
 `tools/run.sh tactile_resonance benchmark faults` runs every row and writes this page; `--row poles_node`
 only the rows whose names hold that text, `--quick` a few. Rows that were not run again keep what they gave
-before (`benchmarks/faults.json`). Times are of a machine that had other work: they distinguish what is
+before (`docs/benchmarks/faults.json`). Times are of a machine that had other work: they distinguish what is
 soon from what waits for a limit, no more. In CI `test/integration/test_faults.py` runs some of them.
 
 Each fault meets a scan that has finished a point, in the middle of the next one, and is judged from
