@@ -257,7 +257,7 @@ def page(scan: LongScan, title: str, setting: str) -> str:
     told = scan.run.latest
     repeats = sum(each.repeats for each in told)
     failed = sum(each.failed for each in told)
-    end = scan.printed.strip().splitlines()
+    end = [line.replace(str(scan.run.path), "RUN") for line in scan.printed.strip().splitlines()]
     return "\n".join(
         [
             f"# {title}",
