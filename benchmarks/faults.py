@@ -65,6 +65,12 @@ time; steps of the monotonic clock; a wall clock that steps in real time; faults
 load cell, which `test/integration/test_contact_faults.py` has. Clocks are stepped by a preloaded library in
 all processes of the command; `/clock` by a second publisher. Disks and folders are those of a mount
 namespace (`unshare`), so that no rights are needed.
+
+A fault of the middleware that cannot be injected: in Fast DDS 3.2 the thread of timers and one that removes
+what another process had can wait for each other (eProsima/Fast-DDS issue 6502, open in November 2026). That
+process then does nothing more; a node like this is `hung` and treated so, but whoever waits in it, a test
+for example, waits until it is ended. Seen once, in a process that had three participants, on one processor
+with twenty processes waiting for it.
 """
 
 
