@@ -20,6 +20,7 @@ from numbers import Integral, Real
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.spectra import Spectrum
@@ -36,12 +37,15 @@ from tactile_resonance.poles.joint_noise import NoiseBands
 from tactile_resonance.poles.judgement import assemble
 from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON, richer
-from tactile_resonance.poles.result import PolesBatch
+from tactile_resonance.poles.model_error import COMPARISON, poorer, richer
+from tactile_resonance.poles.result import STATUS_CODE, PolesBatch, PolesStatus
+from tactile_resonance.poles.significance import NOISE_PASSES_FOR_A_MODE, beside_others
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
 
 METHOD = "joint maximum likelihood of poles and transient"
+# Of a mode: natural frequency, damping ratio, and a residue.
+PARAMETERS_OF_A_MODE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +161,34 @@ class JointPlan:
         u, y = (values.reshape(-1, records, size) for values in (u, y))
         judged = fit_records(self, u, y)
         model = self.model_of(judged.theta)
-        return assemble(judged, model, self.structure, self.band_hz, tuple(shape), method)
+        poles = assemble(judged, model, self.structure, self.band_hz, tuple(shape), method)
+        return self._with_needed(poles, u, y) if self.structure.order > 2 else poles
+
+    def _with_needed(self, poles: PolesBatch, u: ComplexArray, y: ComplexArray) -> PolesBatch:
+        """With modes beside others whose residue noise could make, but without which the fit is worse.
+
+        Two modes nearer than their widths share what the records say of them, so that the residue of one may be
+        uncertain. Twice the fall of the cost is chi-square, with four degrees of freedom a mode (Pintelon &
+        Schoukens, 2nd ed. (2012), section 11.3), at any of the lines (Bonferroni).
+
+        Parameters
+        ----------
+        poles : PolesBatch
+        u, y : (points, M, K) complex
+        """
+        found = poles.significant.reshape(len(y), -1)
+        beside = beside_others(poles.poles_rad_s.reshape(found.shape), found)
+        beside &= poles.status_code.reshape(-1, 1) == STATUS_CODE[PolesStatus.OK]
+        rows = np.flatnonzero(beside.any(axis=-1))
+        if rows.size == 0:
+            return poles
+        less = replace(self, structure=poorer(self.structure), transient_terms=None)
+        fall = less._poles(u[rows], y[rows], poles.method).cost - poles.cost.ravel()[rows]
+        chance = NOISE_PASSES_FOR_A_MODE / poles.lines.ravel()[rows]
+        needed = rows[2 * fall > special.chdtri(PARAMETERS_OF_A_MODE, chance)]
+        found = found.copy()
+        found[needed] |= beside[needed]
+        return replace(poles, significant=found.reshape(poles.significant.shape))
 
     def _checked(self, u: ComplexArray, y: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Bins of both channels, of one shape (..., K)."""

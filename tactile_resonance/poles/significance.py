@@ -71,6 +71,13 @@ def significant_modes(
     return found
 
 
+def beside_others(poles: ComplexArray, found: BoolArray) -> BoolArray:
+    """(batch, k) modes that are not found, nearer to one that is than their widths; poles (batch, k)."""
+    width = np.abs(poles.real)
+    near = np.abs(poles[:, :, None] - poles[:, None, :]) < width[:, :, None] + width[:, None, :]
+    return np.asarray(~found & (near & found[:, None, :]).any(axis=-1))
+
+
 def _neighbours(poles: ComplexArray, there: BoolArray) -> list[IntArray]:
     """Places of two or more poles (k,) each, in ascending order, that are nearer than their widths."""
     places = np.flatnonzero(there)

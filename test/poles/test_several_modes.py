@@ -59,3 +59,21 @@ def test_ellipses_hold_every_mode(f0_hz, band_hz):
     assert result.has_status(PolesStatus.OK).mean() > 0.97
     # and what is not noise does not pass for it
     assert np.mean(result.noise_variance[:, 0]) == pytest.approx(variance, rel=0.1)
+
+
+def test_two_modes_nearer_than_their_widths_are_both_reported_where_one_is_not_enough():
+    """Noise could make the residue of either beside the other, and not those of both."""
+    f0_hz, runs = np.array([248.0, 252.0]), 200
+    args = (RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300))
+    two, one = (JointPlan(*args, ModelStructure(order, order)) for order in (4, 2))
+    u, y = two.transform(*record(f0_hz, 0.02))
+    noise = np.random.default_rng(2).standard_normal((runs, u.size, 2)).view(complex)[..., 0]
+    y = y + 0.05 / np.sqrt(2 * SAMPLES * PERIODS) * noise
+    assert not one.from_bins(u, y).has_status(PolesStatus.OK).any()
+    result = two.from_bins(u, y)
+    both = result.significant.all(axis=-1)
+    assert both.mean() > 0.97
+    assert result.has_status(PolesStatus.OK).mean() > 0.97
+    # their errors are those stated; two of a record depend on each other, and linear propagation has limits
+    errors = (result.f0_hz - f0_hz)[both] / np.sqrt(result.covariance[both, :, 0, 0])
+    assert 0.8 < np.sqrt(np.mean(errors**2)) < 1.3
