@@ -14,6 +14,7 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import TextIO
 
@@ -164,9 +165,9 @@ def _read_csv(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
             names[0] = names[0].removeprefix("#").strip()  # as numpy.savetxt marks a header
             if len(set(names)) < len(names):
                 raise ValueError(f"columns named alike: {', '.join(names)}")
-            columns = np.loadtxt(lines, delimiter=dialect.delimiter, ndmin=2)
-        if not columns.size:
-            raise ValueError("no numbers under the header")
+            if not (first := next(lines, "")):  # loadtxt warns and returns nothing
+                raise ValueError("no numbers under the header")
+            columns = np.loadtxt(chain([first], lines), delimiter=dialect.delimiter, ndmin=2)
     except (csv.Error, ValueError, StopIteration) as error:
         raise ValueError(
             f"{path.name}: no .csv record ({_reason(error)}); expected a header line with the names "

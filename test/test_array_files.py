@@ -91,6 +91,14 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path, data, suffix):
     assert all(array.dtype.kind in "biufc" for array in arrays.values())
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_header_without_numbers_is_refused_in_one_line(tmp_path):
+    for content in ("u,y\n", "u,y\n\n \n"):
+        (tmp_path / "a.csv").write_text(content)
+        with pytest.raises(ValueError, match=r"a\.csv: no \.csv record \(no numbers under the header\)"):
+            read_arrays(tmp_path / "a.csv", NAMES)
+
+
 def test_a_mat_file_is_read_where_memory_is_limited_already(tmp_path):
     pytest.importorskip("resource")
     scipy.io.savemat(tmp_path / "a.mat", {"u": np.arange(3)})

@@ -101,9 +101,9 @@ class ScanRunner:
         self._reference(BEFORE)
         self._air = read_reference(self._run.content, BEFORE)
         while (point := self._next()) is not None:
-            spent_s = self._hands.now_s() - begun_s
-            if spent_s > self._scene.time_limits.scan_s:
-                raise ScanEnded(f"time_limits.scan_s: {spent_s:.0f} s are over")
+            longest_s = self._scene.time_limits.scan_s
+            if self._hands.now_s() - begun_s > longest_s:
+                raise ScanEnded(f"time_limits.scan_s: {longest_s:g} s are over")
             self._point(point)
         self._reference(AFTER)
         if self._scene.protocols:

@@ -240,13 +240,14 @@ def read_stl(path: Path) -> FloatArray:
     Raises
     ------
     ValueError
-        If it cannot be read or holds no triangle, or trimesh is not installed.
+        If it is not there, cannot be read or holds no triangle, or trimesh is not installed.
     """
     try:
         import trimesh  # of the extra `mesh`
     except ImportError as error:
         need = "trimesh, which reads STL: pip install trimesh"
         raise ValueError(f"file: got {path.name!r}; accepted with {need}") from error
+    require(path.is_file(), "file", str(path), "a file that is there")
     log = trimesh.util.log
     try:
         log.addFilter(_nothing)  # of damaged files it logs tracebacks, which appear on stderr
