@@ -8,8 +8,7 @@ the one that is missed least, and so on while the cost falls.
 
 A wide mode across others is the hull of all of them where noise hides each alone. Its residue seems certain,
 while the others would take its place: it counts only where the model without it, fitted anew, is worse than
-noise explains (Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
-section 11.3: twice the fall of the cost is chi-square).
+noise explains (`significance.fall_of_noise`).
 """
 
 from __future__ import annotations
@@ -17,14 +16,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import DenseSolution, least_squares
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
-from tactile_resonance.poles.significance import NOISE_PASSES_FOR_A_MODE
+from tactile_resonance.poles.significance import fall_of_noise
 from tactile_resonance.poles.split import coefficients_of_roots
 
 if TYPE_CHECKING:
@@ -36,8 +34,6 @@ CHANCE = 0.3
 STARTS = 3
 # Poles nearer than this part of a half width are of the same mode.
 SAME = 0.5
-# Of a mode: natural frequency, damping ratio, and a residue.
-PARAMETERS_OF_A_MODE = 4
 
 
 @np.errstate(all="ignore")
@@ -104,8 +100,7 @@ def dispensable(plan: LinesPlan, row: BinData, found: DenseSolution) -> ComplexA
     poles = _poles(plan, found)
     above = poles[poles.imag > 0]
     lines = int(np.isfinite(_variance(plan, row)).sum())
-    fall = special.chdtri(PARAMETERS_OF_A_MODE, NOISE_PASSES_FOR_A_MODE / lines) / 2
-    limit = fall * found.cost / (lines - found.theta.size / 2)
+    limit = fall_of_noise(lines) * found.cost / (lines - found.theta.size / 2)
     out = []
     for k, pole in enumerate(above):
         apart = np.abs(np.delete(above, k).imag - pole.imag)

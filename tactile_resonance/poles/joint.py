@@ -20,7 +20,6 @@ from numbers import Integral, Real
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.spectra import Spectrum
@@ -39,13 +38,11 @@ from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.model_error import COMPARISON, poorer, richer
 from tactile_resonance.poles.result import STATUS_CODE, PolesBatch, PolesStatus
-from tactile_resonance.poles.significance import NOISE_PASSES_FOR_A_MODE, beside_others
+from tactile_resonance.poles.significance import beside_others, fall_of_noise
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
 
 METHOD = "joint maximum likelihood of poles and transient"
-# Of a mode: natural frequency, damping ratio, and a residue.
-PARAMETERS_OF_A_MODE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,18 +159,23 @@ class JointPlan:
         judged = fit_records(self, u, y)
         model = self.model_of(judged.theta)
         poles = assemble(judged, model, self.structure, self.band_hz, tuple(shape), method)
-        return self._with_needed(poles, u, y) if self.structure.order > 2 else poles
+        if self.structure.order == 2 or self.poorer is None:
+            return poles
+        return self._with_needed(poles, self.poorer, u, y)
 
-    def _with_needed(self, poles: PolesBatch, u: ComplexArray, y: ComplexArray) -> PolesBatch:
+    def _with_needed(
+        self, poles: PolesBatch, less: JointPlan, u: ComplexArray, y: ComplexArray
+    ) -> PolesBatch:
         """With modes beside others whose residue noise could make, but without which the fit is worse.
 
         Two modes nearer than their widths share what the records say of them, so that the residue of one may be
-        uncertain. Twice the fall of the cost is chi-square, with four degrees of freedom a mode (Pintelon &
-        Schoukens, 2nd ed. (2012), section 11.3), at any of the lines (Bonferroni).
+        uncertain, and only a fit without it tells; see `fall_of_noise`.
 
         Parameters
         ----------
         poles : PolesBatch
+        less : JointPlan
+            With one mode less.
         u, y : (points, M, K) complex
         """
         found = poles.significant.reshape(len(y), -1)
@@ -182,10 +184,8 @@ class JointPlan:
         rows = np.flatnonzero(beside.any(axis=-1))
         if rows.size == 0:
             return poles
-        less = replace(self, structure=poorer(self.structure), transient_terms=None)
         fall = less._poles(u[rows], y[rows], poles.method).cost - poles.cost.ravel()[rows]
-        chance = NOISE_PASSES_FOR_A_MODE / poles.lines.ravel()[rows]
-        needed = rows[2 * fall > special.chdtri(PARAMETERS_OF_A_MODE, chance)]
+        needed = rows[fall > fall_of_noise(poles.lines.ravel()[rows])]
         found = found.copy()
         found[needed] |= beside[needed]
         return replace(poles, significant=found.reshape(poles.significant.shape))
@@ -306,6 +306,15 @@ class JointPlan:
         """With one mode more; None where the band holds too few lines for it."""
         try:
             plan = replace(self, structure=richer(self.structure), transient_terms=None)
+        except ValueError:
+            return None
+        return plan
+
+    @cached_property
+    def poorer(self) -> JointPlan | None:
+        """With one mode less; None where the numerator has no terms to take with it."""
+        try:
+            plan = replace(self, structure=poorer(self.structure), transient_terms=None)
         except ValueError:
             return None
         return plan

@@ -15,6 +15,8 @@ from tactile_resonance.poles.model import RationalModel
 
 # A mode that noise makes is taken for one this often.
 NOISE_PASSES_FOR_A_MODE = 1e-4
+# Of a mode: natural frequency, damping ratio, and a residue.
+PARAMETERS_OF_A_MODE = 4
 # A single mode whose damping ratio is known to this part is none of noise's making: its residue is known
 # about as well, ten times better than the test below asks for.
 CERTAIN = 0.02
@@ -69,6 +71,15 @@ def significant_modes(
                     residues[row, near], sensitivity[k, near], coefficients[row], int(lines[row])
                 )
     return found
+
+
+def fall_of_noise(lines: npt.ArrayLike) -> FloatArray:
+    """Largest fall of the cost by one mode more that noise makes, of fits to so many lines.
+
+    Twice the fall is chi-square (Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*,
+    2nd ed. (2012), section 11.3), at any of the lines (Bonferroni).
+    """
+    return np.asarray(special.chdtri(PARAMETERS_OF_A_MODE, NOISE_PASSES_FOR_A_MODE / np.asarray(lines)) / 2)
 
 
 def beside_others(poles: ComplexArray, found: BoolArray) -> BoolArray:

@@ -77,3 +77,14 @@ def test_two_modes_nearer_than_their_widths_are_both_reported_where_one_is_not_e
     # their errors are those stated; two of a record depend on each other, and linear propagation has limits
     errors = (result.f0_hz - f0_hz)[both] / np.sqrt(result.covariance[both, :, 0, 0])
     assert 0.8 < np.sqrt(np.mean(errors**2)) < 1.3
+
+
+@pytest.mark.parametrize("numerator_order", [0, 1, 2])
+def test_modes_that_noise_hides_are_judged_whatever_the_numerator(numerator_order):
+    structure = ModelStructure(4, numerator_order)
+    plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), structure)
+    u, y = plan.transform(*record([248.0, 252.0], 0.02))
+    noise = np.random.default_rng(2).standard_normal((50, u.size, 2)).view(complex)[..., 0]
+    result = plan.from_bins(u, y - 0.1 * u + 0.5 / np.sqrt(2 * SAMPLES * PERIODS) * noise)
+    # noise of this size leaves no more than one of them certain
+    assert result.significant.all(axis=-1).mean() < 0.1
