@@ -78,9 +78,14 @@ def _install_all() -> None:
         # Setuptools first: what has no wheel (empy) is then built with the pinned one.
         first = VENV / "setuptools.txt"
         first.write_text(locked()["setuptools"])
-        run([*_PIP, "--require-hashes", "-r", first], "pip.log", failure, _environment())
-        every = ["--require-hashes", "--no-build-isolation", "-r", LOCK, "-r", ROS_LOCK]
-        run([*_PIP, *every], "pip.log", failure, _environment())
+        # The lock is complete. Resolved again, a newer release of what is asked for with extras
+        # (coverage[toml]) is refused by pip before 23.3: it would ask for a hash that is not there.
+        pinned = [*_PIP, "--require-hashes", "--no-deps"]
+        run([*pinned, "-r", first], "pip.log", failure, _environment())
+        every = ["--no-build-isolation", "-r", LOCK, "-r", ROS_LOCK]
+        run([*pinned, *every], "pip.log", failure, _environment())
+        check = [PYTHON, "-m", "pip", "--disable-pip-version-check", "check"]
+        run(check, "pip.log", "the pinned packages lack something or do not fit together", _environment())
 
 
 def _repair_wheels() -> None:
