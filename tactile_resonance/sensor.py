@@ -18,6 +18,9 @@ from tactile_resonance.fields import (
     require,
 )
 
+MAX_LEVEL_V = 4.0
+"""Drive that the sensor bears [V rms]; excitation_node refuses more where its parameter says nothing else."""
+
 
 @dataclass(frozen=True)
 class BeamParameters:

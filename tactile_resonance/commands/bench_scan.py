@@ -208,13 +208,20 @@ def run_job(job: Job) -> int:
     require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can", "rosbags", "plotly")
     from tactile_resonance.client import Ending
     from tactile_resonance.commands import report
+    from tactile_resonance.commands.plan import read_phantoms
     from tactile_resonance.scan.adaptive import WantedBoundary
+    from tactile_resonance.scan.plan import make_plan
     from tactile_resonance.scan.run_directory import RunDirectory
     from tactile_resonance.scan.scene import read_scan_scene
 
     begun_s = time.monotonic()
     # what cannot be scanned is reported before anything is started
     content = read_scan_scene(job.scene)
+    make_plan(content)
+    if read_phantoms(job.scene) is None:
+        raise ValueError(
+            f"{job.scene.name}: no regions; accepted is a scene with what the simulated bench touches"
+        )
     if not job.resume:
         RunDirectory.check_new(job.output, 0)
     job = replace(job, host=take_domain(job.host))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_resonance.commands.options import add_file
-from tactile_resonance.fields import counted
+from tactile_resonance.fields import counted, read_yaml
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tactile_resonance.poles.result import Poles
     from tactile_resonance.scan.plan import Plan
     from tactile_resonance.simulation.tissue.hertz import Tissue
+    from tactile_resonance.simulation.tissue.scene import PhantomScene
 
 HELD_S = 1.0
 """Age of a contact on which a plan is tried."""
@@ -44,10 +45,11 @@ def run(options: argparse.Namespace) -> int:
     from tactile_resonance.scan.scene import read_scan_scene
 
     plan = make_plan(read_scan_scene(options.scene))
+    phantoms = read_phantoms(options.scene)
     print(f"plan of {plan.scene.name}")
     for name, text in plan_rows(plan):
         print(f"{name:>12}  {text}")
-    for text in _expected(options.scene, plan):
+    for text in _expected(phantoms, plan):
         print(f"{'expected':>12}  {text}")
     if options.figure is not None:
         save_figure(_draw(plan), options.figure)
@@ -55,15 +57,29 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _expected(path: Path, plan: Plan) -> list[str]:
-    """Precision and blocks at the first point of each tissue, as the simulated bench measures them."""
+def read_phantoms(path: Path) -> PhantomScene | None:
+    """What a scene file has for the simulated bench; None where it has nothing of that.
+
+    Raises
+    ------
+    ValueError
+        If a part of it is missing or wrong.
+    """
+    from tactile_resonance.scan.scene import BENCH_KEYS
     from tactile_resonance.simulation.tissue.library import read_tissues
     from tactile_resonance.simulation.tissue.scene import read_scene
 
-    try:
-        phantoms = read_scene(read_tissues(), path)
-    except ValueError as error:
-        return [f"precision unknown: nothing to try it on ({error})"]
+    if BENCH_KEYS.isdisjoint(read_yaml(path)):
+        return None
+    return read_scene(read_tissues(), path)
+
+
+def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
+    """Precision and blocks at the first point of each tissue, as the simulated bench measures them."""
+    if phantoms is None:
+        return [
+            "precision unknown: the scene has no regions to try it on; a simulated scan needs them"
+        ]
     lines, blocks, tried = [], [], set()
     for point in plan.first_points:
         tissue = phantoms.tissue_at(point.position_m)

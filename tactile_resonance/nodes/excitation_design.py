@@ -15,6 +15,7 @@ from tactile_resonance.drivers.acquisition import DeviceInfo
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.recording.messages import bands_from_message
+from tactile_resonance.sensor import MAX_LEVEL_V
 
 GRIDS = {
     Measure.Goal.GRID_FULL: Grid.FULL,
@@ -34,7 +35,7 @@ PARAMETERS = (
     Parameter("level_v", 1.0, "Root mean square of the drive [V].", 1e-6, 1e3),
     Parameter(
         "max_level_v",
-        4.0,
+        MAX_LEVEL_V,
         "The sensor's limit: a level above is refused [V rms].",
         1e-6,
         1e3,

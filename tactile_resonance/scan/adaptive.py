@@ -27,7 +27,7 @@ from tactile_resonance.fields import build, check_above_zero, check_within, read
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.points import Pair, Places, grid, inside_polygon
+from tactile_resonance.scan.points import Pair, Places, corners, grid, inside_polygon
 from tactile_resonance.tissue.classify import TissueClass
 
 MOST_PLACES = 2500
@@ -353,9 +353,7 @@ class _Asked:
         alone |= self.polygon_m is not None and self.center_m is None and self.size_m is None
         require(alone, "center_m, size_m, polygon_m", given, "center_m and size_m, or polygon_m")
         if self.polygon_m is not None:
-            corners = self.polygon_m[:, :2]
-            require(len(corners) >= 3, "polygon_m", len(corners), "three corners or more")
-            return corners
+            return corners(self.polygon_m)
         center, size = np.array(self.center_m), np.array(self.size_m)
         require(bool(size.min() > 0), "size_m", self.size_m, "numbers above 0")
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

@@ -19,6 +19,7 @@ from tactile_resonance.scan.references import SILENT
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import Output, ScanScene
 from tactile_resonance.scan.surface import TouchRequest
+from tactile_resonance.sensor import MAX_LEVEL_V
 
 Rows = list[tuple[str, str]]
 
@@ -89,6 +90,7 @@ def plan_rows(plan: Plan) -> Rows:
         drawn += [*map_names(len(design.bands)), "map.mcap"]
     rows.append(("drawn", ", ".join(drawn)))
     rows.append(("time", f"{plan.shortest_s:.0f} to {plan.longest_s:.0f} s"))
+    rows += [("limit", text) for text in _limits(plan)]
     for left in plan.skipped:
         saved = f"; saves up to {left.saved_s:.1f} s" if left.saved_s else ""
         rows.append(("skipped", f"{left.what}: {left.why}{saved}"))
@@ -130,6 +132,28 @@ def _period(plan: Plan) -> str:
         f"the shortest with {lines_wanted(needed)} lines from {needed.low_hz:g} to {needed.high_hz:g} Hz, as "
         f"many as one block takes for its model and noise{'' if plan.scene.gate is None else gated}"
     )
+
+
+def _limits(plan: Plan) -> list[str]:
+    """What will end the scan or its points before they are complete."""
+    limits, level_v = plan.scene.time_limits, plan.measurement.level_v
+    point_s = plan.duration_s(plan.measurement.blocks.least, 1)
+    texts = []
+    if limits.scan_s < plan.shortest_s:
+        texts.append(
+            f"time_limits.scan_s: {limits.scan_s:g} s are over before all points are measured "
+            f"({plan.shortest_s:.0f} s or more); `resume` goes on"
+        )
+    if limits.point_s < point_s:
+        texts.append(
+            f"time_limits.point_s: {limits.point_s:g} s; a point takes {point_s:.1f} s or more and fails"
+        )
+    if level_v > MAX_LEVEL_V:
+        texts.append(
+            f"sensor.level_v: {level_v:.3g} V rms, excitation_node refuses more than its max_level_v, by "
+            f"default {MAX_LEVEL_V:g} V rms: points fail"
+        )
+    return texts
 
 
 def _mains(design: MeasurementDesign) -> str:

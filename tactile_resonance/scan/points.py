@@ -171,6 +171,21 @@ def inside_polygon(xy_m: npt.ArrayLike, polygon_m: npt.ArrayLike) -> BoolArray:
     return np.asarray(odd | on_edge)
 
 
+def corners(polygon_m: FloatArray) -> FloatArray:
+    """(k, 2) of a polygon as a scene gives it, (k, 3).
+
+    Raises
+    ------
+    ValueError
+        If they enclose nothing: fewer than three, or all on one line.
+    """
+    xy_m = polygon_m[:, :2]
+    require(len(xy_m) >= 3, "polygon_m", len(xy_m), "three corners or more")
+    wide = np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0)) == 2
+    require(bool(wide), "polygon_m", xy_m.tolist(), "corners that are not all on one line")
+    return np.asarray(xy_m)
+
+
 def read_positions(fields: Mapping[str, Any], where: str) -> FloatArray:
     """(n, 3) positions of a scene's section [m]; z is NaN where the surface decides it.
 
@@ -269,8 +284,7 @@ class _Region:
     order: Order = "serpentine"
 
     def positions(self) -> FloatArray:
-        polygon = self.polygon_m[:, :2]
-        require(len(polygon) >= 3, "polygon_m", len(polygon), "three corners or more")
+        polygon = corners(self.polygon_m)
         low, high = polygon.min(axis=0), polygon.max(axis=0)
         whole = grid((low + high) / 2, high - low, self.spacing_m, self.order)
         kept = whole[inside_polygon(whole, polygon)]

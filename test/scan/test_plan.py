@@ -98,6 +98,10 @@ def test_region_keeps_the_grid_points_in_it():
         ({"list": [[0, 0], [0, 1e200]]}, r"positions\[1\]: got .*1e\+200.* within 10 m"),
         ({"around": dict.fromkeys(("centres_m", "offsets_m"), [[0, 0]] * 400)}, "at most 100000"),
         ({"region": {"polygon_m": [[0, 0], [1, 0]], "spacing_m": 1}}, "three corners"),
+        (
+            {"region": {"polygon_m": [[0, 0], [1, 1], [2, 2]], "spacing_m": 1}},
+            "not all on one line",
+        ),
     ],
 )
 def test_wrong_positions_are_refused(fields, reason):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a plan says of a scene, and what is said of it once it was carried out."""
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Precise, Verdict, decide_bands
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.plan_text import plan_against_outcome, plan_rows
-from tactile_resonance.scan.scene import Output, read_run_scene, read_scan_scene
+from tactile_resonance.scan.scene import Output, TimeLimits, read_run_scene, read_scan_scene
 from tactile_resonance.scan.surface import NormalRequest, TouchRequest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -108,3 +109,50 @@ def test_a_run_of_an_earlier_version_is_read_with_outputs_that_are_refused_today
     assert read_run_scene(path).outputs == (Output.POLES, Output.MAP)
     with pytest.raises(ValueError, match="relaxation"):
         read_scan_scene(path)
+
+
+def test_a_plan_names_each_limit_that_its_scan_would_meet():
+    asked = scene(points=3)
+    assert "limit" not in told(asked)
+    short = replace(
+        asked,
+        time_limits=TimeLimits(point_s=0.5, scan_s=2.0),
+        sensor=replace(asked.sensor, level_v=1000.0),
+    )
+    whole, point, level = told(short)["limit"]
+    assert whole.startswith("time_limits.scan_s: 2 s are over before all points")
+    assert point.startswith("time_limits.point_s: 0.5 s")
+    assert level.startswith("sensor.level_v: ")
+
+
+REGIONS = "regions: [{gelatine_percent: %s, disc: {center_m: [0, 0], radius_m: 0.02}}]\n"
+
+
+@pytest.mark.parametrize("command", ["plan", "scan --scene"])
+@pytest.mark.parametrize(
+    ("bench", "refused"),
+    [
+        (REGIONS % 500, r"regions\[0\].gelatine_percent: got 500"),
+        ("buried: []\n", "regions: got None"),
+    ],
+)
+def test_what_the_bench_would_refuse_is_refused_before_anything_starts(
+    bench, refused, command, capsys, tmp_path
+):
+    path = tmp_path / "scene.yaml"
+    path.write_text(f"force_n: 0.01\npositions: {{list: [[0, 0]]}}\n{bench}")
+    assert main([*command.split(), str(path)]) != 0
+    told = capsys.readouterr()
+    assert re.search(refused, told.err)
+    assert not told.out
+
+
+def test_a_scene_of_hardware_is_planned_without_regions_and_not_scanned_on_the_bench(
+    capsys, tmp_path
+):
+    path = tmp_path / "scene.yaml"
+    path.write_text("force_n: 0.01\npositions: {list: [[0, 0]]}\n")
+    assert main(["plan", str(path)]) == 0
+    assert "precision unknown: the scene has no regions" in capsys.readouterr().out
+    assert main(["scan", "--scene", str(path)]) != 0
+    assert "no regions" in capsys.readouterr().err

@@ -57,7 +57,7 @@ class TissueLibrary:
             gelatines of different Prony terms.
         """
         low, high = GELATINE_PERCENT_RANGE
-        require(low <= percent <= high, "percent", percent, f"{low:g} to {high:g} % w/w")
+        require(low <= percent <= high, "gelatine_percent", percent, f"{low:g} to {high:g} % w/w")
         table = {t.gelatine_percent: t for t in self.tissues.values() if t.gelatine_percent}
         require(len(table) >= 2, "tissues", len(table), "a library with two or more gelatines")
         first = next(iter(table.values()))

@@ -137,7 +137,7 @@ def test_later_regions_cover_earlier_ones(library):
     ("change", "named"),
     [
         ({"tissue": "jelly"}, r"regions\[0\]\.tissue: got 'jelly'"),
-        ({"gelatine_percent": 99.0}, r"regions\[0\]\.percent: got 99"),
+        ({"gelatine_percent": 99.0}, r"regions\[0\]\.gelatine_percent: got 99"),
         ({"sphere": {"center_m": [0, 0, 0], "radius_m": 1}}, r"regions\[0\].*exactly one of"),
         ({"colour": "red"}, r"regions\[0\]\.colour"),
         ({"disc": {"center_m": [0, 0, 0], "radius_m": 1}}, r"disc\.center_m.*2 numbers"),
