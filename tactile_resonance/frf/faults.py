@@ -14,7 +14,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy import special
 
-from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.tones import MAINS_HZ, ROUNDING
@@ -351,14 +351,30 @@ def lost_samples(x: _Channel) -> Fault | None:
     shift = np.argmax(correlation, axis=-1)
     shift = np.where(shift > samples // 2, shift - samples, shift)
     unshifted = correlation[:, 0]
-    # a shift that explains the data no better than none is chance
+    # a shift that explains the data no better than none is chance, and so is one that noise makes
     clear = np.max(correlation, axis=-1) > 2 * np.abs(unshifted)
-    shift = np.where(clear, shift, 0)
+    shift = np.where(clear & _coherent(lines, shift, x.harmonics, samples), shift, 0)
     if not np.any(shift):
         return None
     worst = int(shift[np.argmax(np.abs(shift))])
     text = f"Periods of the {x.name} are shifted by {worst} samples: some were lost in between"
     return x.fault(FaultKind.LOST_SAMPLES, abs(worst), True, text)
+
+
+def _coherent(lines: ComplexArray, shift: IntArray, harmonics: IntArray, samples: int) -> BoolArray:
+    """(P - 1,) whether periods, shifted back, are more alike to the first than periods of noise.
+
+    The coherence r^2 over F lines of noise exceeds c with the probability (1 - c)^(F - 1) at one shift, with
+    at most N times that at any of N (Carter, Knapp, Nuttall, IEEE Trans. Audio Electroacoust. 21, 1973, 337).
+    """
+    level = np.sqrt(np.mean(np.abs(lines) ** 2, axis=0))  # (F,), of noise that is not white
+    white = np.divide(lines, level, out=np.zeros_like(lines), where=level > 0)
+    back = np.exp(2j * np.pi * shift[:, None] * harmonics / samples)
+    power = np.sum(np.abs(white) ** 2, axis=-1)
+    cross = np.abs(np.sum(white[1:] * back * white[0].conj(), axis=-1)) ** 2
+    incoherent = 1 - cross / np.maximum(power[1:] * power[0], np.finfo(float).tiny)  # (P - 1,)
+    chance = (_FALSE_ALARM / samples) ** (1 / max(harmonics.size - 1, 1))
+    return np.asarray(incoherent < chance)
 
 
 def unsettled(x: _Channel) -> Fault | None:

@@ -110,7 +110,8 @@ def suspected_skew(frf: FRF) -> Fault | None:
     turned = abs(2 * np.pi * delay * f[-1])
     # against what it turns over the lines: near a mode it turns too, but along no straight line
     turned_over_lines = abs(2 * np.pi * delay * (f[-1] - f[0]))
-    straight = np.sqrt(np.mean(residual**2)) < 0.05 * max(turned_over_lines, 0.1)
+    # and within what phases of noise, pi / sqrt(3) about any line, are far above
+    straight = np.sqrt(np.mean(residual**2)) < min(0.05 * max(turned_over_lines, 0.1), 0.3)
     through_origin = abs(np.sin(intercept)) < 0.1 * max(turned, 1.0)
     if turned < 0.05 or not straight or not through_origin or abs(delay) < 5 * std:
         return None

@@ -108,6 +108,26 @@ def test_few_lost_samples_show_where_lines_reach_far_enough(multisine, lost, las
     assert (FaultKind.LOST_SAMPLES in report.kinds) is found
 
 
+@pytest.mark.parametrize("lines", [LINES, LINES[:5]])
+def test_noise_is_not_taken_for_lost_samples_and_lost_samples_are_seen_through_it(multisine, lines):
+    rng = np.random.default_rng(5)
+    u = np.tile(multisine(lines, SAMPLES, rng, amplitude=0.1), (30, 4, 1))
+    cut = np.delete(u.reshape(30, -1), np.arange(2500, 2537), axis=-1)
+    cut = np.append(cut, u[:, 0, :37], axis=-1).reshape(u.shape)
+    rms = 0.1 * np.sqrt(lines.size / 2)
+    noise = rms * rng.standard_normal((3, *u.shape))
+    coloured = signal.lfilter([1.0], [1.0, -1.6, 0.8], noise[0], axis=-1)
+
+    def seen(y):
+        report = find_faults(Spectrum.of(u, y), sample_rate_hz=RATE, harmonics=lines)
+        return [f.seen_in for f in report.faults if f.kind is FaultKind.LOST_SAMPLES]
+
+    for of_noise in (noise[1], coloured, 0.01 * u + noise[2]):
+        assert not seen(of_noise)
+    # as strong as the signal in the whole band, and where few lines have to say it a tenth of that
+    assert seen(cut + (1 if lines is LINES else 0.1) * noise[1]) == ["(in 30 of 30 records)"]
+
+
 def test_offset_and_drift(record):
     u, y = record
     fault = only(check(u, y + 1), FaultKind.OFFSET, "sensor")

@@ -98,6 +98,16 @@ def test_skew_is_suspected_where_a_flat_response_has_straight_phase(multisine):
     assert "loop-back" in fault.message
 
 
+def test_phases_of_noise_are_no_delay(multisine):
+    rng = np.random.default_rng(7)
+    suspected = []
+    for _ in range(50):
+        u, y = loopback(rng, multisine, 0.0, 1)
+        spectra = averaged_spectra(Spectrum.of(u, rng.standard_normal(y.shape)), LINES)
+        suspected.append(suspected_skew(fast_frf(spectra, sample_rate_hz=RATE)))
+    assert suspected == [None] * 50
+
+
 def test_refusals(multisine):
     rng = np.random.default_rng(6)
     u, y = loopback(rng, multisine, 0.0)
