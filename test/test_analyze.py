@@ -158,7 +158,7 @@ BAD = {
         "sample_rate_hz (--sample-rate): got 0.0",
     ),
     "broken period": (damaged(samples_per_period=1999), (), "expected a multiple of the period"),
-    "order": (damaged(), ("--order", 0), "order (--order): 0"),
+    "order": (damaged(), ("--order", -1), "order (--order): -1"),
     "orders": (
         damaged(),
         ("--order", "auto", "--numerator-order", 7),
@@ -352,6 +352,9 @@ def test_outputs_never_replace_what_they_must_not(good, tmp_path, capsys):
         printed = capsys.readouterr()
         assert message in printed.err
         assert printed.out == ""
+    for options in (["--force", 0.01], ["--from-rest"], ["--relaxed-ratio", 1.2]):
+        assert cli.main(["analyze", str(good), *map(str, options)]) == 1
+        assert "accepted is one beside --calibration" in capsys.readouterr().err
     assert good.read_bytes() == before
     assert fifo.is_fifo()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["device", "good.npz"]

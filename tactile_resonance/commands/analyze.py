@@ -19,14 +19,14 @@ from tactile_resonance.analysis import (
 )
 from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
 from tactile_resonance.calibration.validity import as_of_today
-from tactile_resonance.commands.options import FIGURES, add_band, add_file, check_output
+from tactile_resonance.commands.options import add_band, add_figure, add_file, add_output
 from tactile_resonance.contact_analysis import ContactAnalysis, contact_content, estimate_contact
 from tactile_resonance.fields import band, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.front import read_record, read_run
 from tactile_resonance.poles.order_choice import CANDIDATES
-from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, ModelStructure
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.silent import silent_record
 
@@ -98,14 +98,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="excited multiples of the sample rate over the samples per period, LAST included; "
         "default: the file's, else found from the spectrum of u",
     )
-    add_band(parser, "around the strongest resonance")
+    add_band(parser, "of a run that of its scene, else around the strongest resonance")
     parser.add_argument(
         "--order",
         type=parse_order,
-        default=2,
         metavar="N",
-        help="of the denominator, two per mode (default: 2); auto: the data choose one to three modes "
-        "and six to ten residual terms, by description length",
+        help="of the denominator, two per mode (default: a run's own, else 2); auto or 0: the data choose one "
+        "to three modes and six to ten residual terms, by description length",
     )
     parser.add_argument(
         "--numerator-order",
@@ -168,19 +167,18 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--relaxed-ratio",
         type=float,
-        default=1.0,
         metavar="X",
         help="with --calibration: modulus at the mode over that under the held force (default: 1)",
     )
-    add_file(parser, "--json", "write the result here")
-    add_file(parser, "--plot", "draw it here (.png, .pdf, .svg)")
+    add_output(parser, "--json", "write the result here")
+    add_figure(parser, "--plot", "draw it here")
     parser.set_defaults(run=run)
 
 
-def parse_order(text: str) -> int | None:
-    """'4' as 4, 'auto' as None."""
+def parse_order(text: str) -> int:
+    """'4' as 4, 'auto' as the 0 of scenes."""
     if text == "auto":
-        return None
+        return 0
     try:
         return int(text)
     except ValueError:
@@ -238,6 +236,10 @@ def _run(options: argparse.Namespace) -> int:
         options.measurement = measurement_at(options.record, options.point)
     if options.calibration is not None:
         return _analyze_contacts(options)
+    for name in ("force", "from_rest", "relaxed_ratio"):
+        given = getattr(options, name) not in (None, False)
+        option = f"--{name.replace('_', '-')}"
+        require(not given, option, getattr(options, name), "one beside --calibration")
     recording = _recording(options)
     rate_hz = recording.sample_rate_hz
     band_hz = None if options.band is None else band(options.band, most_hz=rate_hz / 2)
@@ -248,8 +250,16 @@ def _run(options: argparse.Namespace) -> int:
         found = silent_record(recording.u, recording.y, sample_rate_hz=rate_hz, band_hz=band_hz)
         print(found.text())
         return 0
-    structures = [ModelStructure.with_residual(2 if options.order is None else options.order)]
-    if options.order is None:
+    order, residual_terms = options.order, DEFAULT_RESIDUAL_TERMS
+    if (options.record / "run.json").is_file():
+        from tactile_resonance.scan.reidentify import scene_band
+
+        of_scene = scene_band(options.record)
+        band_hz = of_scene.ends_hz if band_hz is None else band_hz
+        if order is None:
+            order, residual_terms = of_scene.order, of_scene.residual_terms
+    structures = [ModelStructure.with_residual(2 if order is None else order or 2, residual_terms)]
+    if order == 0:
         if options.numerator_order is not None:
             raise ValueError("numerator_order: got a number; with --order auto it is chosen")
         structures = list(CANDIDATES)
@@ -333,9 +343,8 @@ def as_text(analysis: Analysis) -> str:
 
 def _check_outputs(options: argparse.Namespace) -> None:
     """Refuse an impossible output before any work is done."""
-    for name, endings in (("json", ()), ("plot", FIGURES)):
+    for name in ("json", "plot"):
         if (path := getattr(options, name)) is not None:
-            check_output(f"--{name}", path, endings)
             own = path.exists() and options.record.exists() and path.samefile(options.record)
             require(not own, f"--{name}", str(path), "another file than the record itself")
     same = options.json is not None and options.json == options.plot
@@ -359,7 +368,7 @@ def _analyze_contacts(options: argparse.Namespace) -> int:
             force_n=force_n if options.force is None else options.force,
             force_std_n=force_std_n if options.force is None else 0.0,
             from_rest=options.from_rest,
-            relaxed_ratio=options.relaxed_ratio,
+            relaxed_ratio=1.0 if options.relaxed_ratio is None else options.relaxed_ratio,
         )
         print(contact_as_text(found, label))
         contents[key] = contact_content(found)

@@ -16,7 +16,7 @@ from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.records import CalibrationRecord, Load
 from tactile_resonance.calibration.validity import check_in_air, poles_in_air
 from tactile_resonance.cantilever import tip_mass
-from tactile_resonance.commands.options import add_file
+from tactile_resonance.commands.options import add_figure, add_file, add_output
 from tactile_resonance.fields import number, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.front import read_record
@@ -73,8 +73,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         default="bimorph",
         help="of config/sensors: its ball's radius (default: bimorph)",
     )
-    add_file(parser, "--output", "write the calibration here")
-    add_file(parser, "--plot", "draw responses and residuals here")
+    add_output(parser, "--output", "write the calibration here")
+    add_figure(parser, "--plot", "draw responses and residuals here")
     add_file(parser, "--check", "compare one record in air with this calibration")
     parser.add_argument(
         "--simulated",

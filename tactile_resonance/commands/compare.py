@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_file, add_runs
+from tactile_resonance.commands.options import add_file, add_output, add_runs
 from tactile_resonance.fields import counted
 from tactile_resonance.files import csv_text, write_whole
 
@@ -33,7 +32,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "discovery rate, and groups of alike points, found without references; as OUTPUT.csv and OUTPUT.png.",
     )
     add_runs(parser)
-    parser.add_argument("--output", type=Path, required=True, metavar="OUTPUT")
+    add_output(
+        parser, "--output", "write OUTPUT.csv and OUTPUT.png", required=True, metavar="OUTPUT"
+    )
     spread = parser.add_mutually_exclusive_group()
     add_file(
         spread,

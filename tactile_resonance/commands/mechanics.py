@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_file
+from tactile_resonance.commands.options import add_figure, add_output
 from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
 
@@ -39,8 +39,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         metavar="M",
         help="of the tissue on what is rigid: whether Hertz's force holds",
     )
-    add_file(parser, "--json", "write all figures")
-    add_file(parser, "--plot", "draw force and model")
+    add_output(parser, "--json", "write all figures")
+    add_figure(parser, "--plot", "draw force and model")
     of_files = parser.add_argument_group("files only: a run knows these")
     of_files.add_argument(
         "--protocol",

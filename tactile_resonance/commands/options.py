@@ -23,24 +23,46 @@ def add_runs(parser: argparse.ArgumentParser) -> None:
 
 def add_file(parser: argparse._ActionsContainer, option: str, text: str, **more: Any) -> None:
     """An option that names a file."""
-    parser.add_argument(option, type=Path, metavar="FILE", help=text, **more)
+    parser.add_argument(option, type=Path, help=text, **{"metavar": "FILE", **more})
+
+
+class _Output(argparse.Action):
+    """Takes the path of a file to be written; refuses before any work is done what cannot be."""
+
+    def __init__(self, *given: Any, endings: Sequence[str] = (), **more: Any) -> None:
+        super().__init__(*given, **more)
+        self._endings = endings
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, taken: argparse.Namespace, path: Any, *_: object
+    ) -> None:
+        option, folder = self.option_strings[0], path.parent
+        writable = folder.is_dir() and os.access(folder, os.W_OK)
+        require(writable, option, str(path), "a file in a folder that can be written")
+        regular = not path.exists() or path.is_file()
+        require(regular, option, str(path), "a new file, or a regular one to replace")
+        right = not self._endings or path.suffix.lower() in self._endings
+        require(right, option, str(path), f"a file that ends in {', '.join(self._endings)}")
+        setattr(taken, self.dest, path)
+
+
+def add_output(
+    parser: argparse._ActionsContainer, option: str, text: str, *endings: str, **more: Any
+) -> None:
+    """An option that names a file to be written, checked as the arguments are read."""
+    add_file(parser, option, text, action=_Output, endings=endings, **more)
+
+
+def add_figure(parser: argparse._ActionsContainer, option: str, text: str) -> None:
+    """An option that names a figure to be written."""
+    *first, last = FIGURES
+    add_output(parser, option, f"{text} ({', '.join(first)} or {last})", *FIGURES)
 
 
 def add_band(parser: argparse.ArgumentParser, default: str) -> None:
     """The option ``--band``; None where it is not given."""
     text = f"[Hz] of the fit; default: {default}"
     parser.add_argument("--band", type=float, nargs=2, metavar=("LO", "HI"), help=text)
-
-
-def check_output(option: str, path: Path, endings: Sequence[str] = ()) -> None:
-    """``ValueError`` where a file cannot be written, or has another ending."""
-    parent = path.parent
-    writable = parent.is_dir() and os.access(parent, os.W_OK)
-    require(writable, option, str(path), "a file in a folder that can be written")
-    regular = not path.exists() or path.is_file()
-    require(regular, option, str(path), "a new file, or a regular one to replace")
-    right = not endings or path.suffix.lower() in endings
-    require(right, option, str(path), f"a file that ends in {', '.join(endings)}")
 
 
 def require_packages(*packages: str) -> None:

@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_file
+from tactile_resonance.commands.options import add_figure
 from tactile_resonance.fields import counted, read_yaml
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "first point of each as planned, and its precision and blocks are printed as expected.",
     )
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file")
-    add_file(parser, "--figure", "draw points and lines (.png, .svg, .pdf)")
+    add_figure(parser, "--figure", "draw points and lines")
     parser.set_defaults(run=run)
 
 

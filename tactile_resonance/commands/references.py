@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_file, add_runs
+from tactile_resonance.commands.options import add_figure, add_file, add_output, add_runs
 from tactile_resonance.fields import counted
 from tactile_resonance.files import write_whole
 
@@ -42,7 +42,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "classes that follow as a file for `tissue_classes` of scenes, and try them on points left out.",
     )
     _add_runs(build)
-    add_file(build, "--output", "the library", required=True)
+    add_output(build, "--output", "the library", required=True)
     build.add_argument(
         "--pool",
         action="store_true",
@@ -89,7 +89,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     _add_runs(variance)
     variance.set_defaults(run=_variance)
     for each in (build, check, variance):
-        add_file(each, "--figure", ".png, .svg or .pdf")
+        add_figure(each, "--figure", "draw it here")
 
 
 def _add_runs(parser: argparse.ArgumentParser) -> None:

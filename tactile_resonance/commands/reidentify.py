@@ -6,9 +6,8 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import replace
-from pathlib import Path
 
-from tactile_resonance.commands.options import ProgressBar, add_band, add_runs, check_output
+from tactile_resonance.commands.options import ProgressBar, add_band, add_output, add_runs
 from tactile_resonance.fields import band, counted, require
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -23,11 +22,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "folder (bins.npz) and taken from the records once.",
     )
     add_runs(parser)
-    parser.add_argument(
+    add_output(
+        parser,
         "--output",
-        type=Path,
+        "write OUTPUT.csv and OUTPUT.npz (default: reidentified in the folder of the only run)",
         metavar="OUTPUT",
-        help="write OUTPUT.csv and OUTPUT.npz (default: reidentified in the folder of the only run)",
     )
     add_band(parser, "that of each run's scene")
     parser.add_argument(
@@ -63,8 +62,6 @@ def run(options: argparse.Namespace) -> int:
         several = len(options.runs) > 1
         require(not several, "--output", None, "one name for the result of several runs")
         output = options.runs[0] / "reidentified"
-    else:
-        check_output("--output", output)
     csv, npz = (output.with_name(output.name + ending) for ending in (".csv", ".npz"))
     begun_s = time.monotonic()
     with ProgressBar(unit_scale=True) as bar:

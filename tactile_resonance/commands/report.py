@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from tactile_resonance.commands.options import add_file
+from tactile_resonance.commands.options import add_output
 from tactile_resonance.files import write_whole
 
 COMPARISON = Path("comparison.html")
@@ -30,7 +30,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         metavar="RUN",
         help="folder of a run; several: a comparison",
     )
-    add_file(
+    add_output(
         parser,
         "--output",
         f"of a comparison (default: {COMPARISON}); the files of one run are in its folder",

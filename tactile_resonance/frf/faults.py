@@ -361,7 +361,12 @@ def lost_samples(x: _Channel) -> Fault | None:
     return x.fault(FaultKind.LOST_SAMPLES, abs(worst), True, text)
 
 
-def _coherent(lines: ComplexArray, shift: IntArray, harmonics: IntArray, samples: int) -> BoolArray:
+def _coherent(
+    lines: ComplexArray,
+    shift: IntArray,
+    harmonics: npt.NDArray[np.integer],
+    samples: int,
+) -> BoolArray:
     """(P - 1,) whether periods, shifted back, are more alike to the first than periods of noise.
 
     The coherence r^2 over F lines of noise exceeds c with the probability (1 - c)^(F - 1) at one shift, with

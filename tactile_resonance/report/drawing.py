@@ -14,7 +14,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
 
 SIMULATED = "simulated, not measured"
@@ -37,16 +36,7 @@ def figure_bytes(figure: Figure, suffix: str) -> bytes:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write the figure, whole or not at all.
-
-    Raises
-    ------
-    ValueError
-        If the suffix is that of no format.
-    """
-    known = FigureCanvasAgg.get_supported_filetypes()
-    good = path.suffix.lstrip(".").lower() in {"", *known}
-    require(good, f"figure {path}", path.suffix, ".png, .svg or .pdf")
+    """Write the figure, whole or not at all."""
     write_whole(path, figure_bytes(figure, path.suffix))
 
 

@@ -276,7 +276,8 @@ def test_refusals(tmp_path, capsys):
     check = ["references", "check", run, other, "--library", NOMINAL]
     check += ["--labels", tmp_path / "all.csv", "--figure", tmp_path / "x.docx"]
     message = called(check, capsys, status=1)
-    assert "x.docx: got '.docx'; accepted is .png, .svg or .pdf" in message
+    assert "--figure: got" in message
+    assert "x.docx'; accepted is a file that ends in .png, .pdf, .svg" in message
     arguments = ["references", "build", run, "--labels", "scene", "--output", tmp_path / "x.yaml"]
     damaged = next((other / "recording").glob("point-00001*"))
     damaged.write_bytes(damaged.read_bytes()[:50])

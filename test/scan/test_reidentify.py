@@ -95,6 +95,10 @@ def test_band_and_model_are_those_of_the_scene(tmp_path, capsys):
     assert rows[0]["f0_hz"] == alone["f0_hz"]
     assert rows[0]["f0_hz_2"] == "nan"
     assert rows[1]["f0_hz_2"] == pair["f0_hz_2"]
+    # so are those of `analyze`
+    both = analyzed(two, table(two / "reidentified.csv")[0]["measurement_id"], tmp_path / "a.json")
+    assert both["band_hz"] == [215.0, 285.0]
+    assert sorted(pole["f0_hz"] for pole in both["poles"]) == pytest.approx(found, rel=1e-6)
     assert main(["reidentify", str(one), "--numerator-order", "2"]) == 1
     assert "--order" in capsys.readouterr().err
 
