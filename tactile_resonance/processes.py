@@ -91,14 +91,16 @@ class NodeProcesses:
             process.wait()
 
     def check(self) -> None:
-        """RuntimeError if a node has ended without being stopped, with the last line it printed."""
-        for node, process in self._processes.items():
-            if process.poll() is not None:
-                lines = (self._log_folder / f"{node}.log").read_text(errors="replace").split("\n")
-                last = next((line for line in reversed(lines) if line.strip()), "no output")
-                raise RuntimeError(
-                    f"{node} ended with exit status {process.returncode}: {last.strip()}"
-                )
+        """RuntimeError if nodes have ended without being stopped, with the last line that each printed."""
+        ended = {node for node, process in self._processes.items() if process.poll() is not None}
+        texts = []
+        for node in sorted(ended):
+            lines = (self._log_folder / f"{node}.log").read_text(errors="replace").split("\n")
+            last = next((line for line in reversed(lines) if line.strip()), "no output")
+            status = self._processes[node].returncode
+            texts.append(f"{node} ended with exit status {status}: {last.strip()}")
+        if texts:
+            raise RuntimeError("; ".join(texts))
 
     def stop(self) -> None:
         """Interrupt, and kill what has not ended within the grace period.

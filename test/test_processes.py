@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which domain nodes are started in."""
+"""Which domain nodes are started in, and which of them have ended."""
 
 import os
 import socket
+import time
 
 import pytest
 
-from tactile_resonance.processes import free_domain_id, hold_domain
+from tactile_resonance.processes import NodeProcesses, free_domain_id, hold_domain
 
 
 @pytest.mark.parametrize("participant", [0, 3, 119])
@@ -33,3 +34,18 @@ def test_a_domain_that_is_given_is_taken():
     assert free_domain_id({"ROS_DOMAIN_ID": "7"}) == 7
     with pytest.raises(ValueError, match="ROS_DOMAIN_ID: '233', expected a number from 0 to 232"):
         free_domain_id({"ROS_DOMAIN_ID": "233"})
+
+
+def test_every_node_that_has_ended_is_named_with_its_last_line(tmp_path):
+    with NodeProcesses(tmp_path, ("sh", "-c", "echo begun; echo cause; kill -9 $$")) as nodes:
+        for node in ("poles_node", "frf_node"):
+            nodes.start(node)
+        told = ""
+        while told.count(";") < 1:  # until both have ended
+            time.sleep(0.01)
+            try:
+                nodes.check()
+            except RuntimeError as error:
+                told = str(error)
+    ended = "ended with exit status -9: cause"
+    assert told == f"frf_node {ended}; poles_node {ended}"
