@@ -7,6 +7,7 @@ The names are those of the package itself (``import tactile_resonance as tr``).
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from tactile_resonance.analysis import analyse
 from tactile_resonance.fields import require_kind, whole
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.excited import find_excited_harmonics
-from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -231,4 +232,7 @@ def identify_poles(
         if poles.status is PolesStatus.TOO_FEW_LINES:
             raise ValueError(f"band_hz: {poles.message}")
         return poles
-    return analyse(data, band_hz=band_hz, structure=structure).poles
+    analysis = analyse(data, band_hz=band_hz, structure=structure)
+    frf, poles = analysis.frf, analysis.poles
+    of_record = "" if frf.status is FrfStatus.OK else frf.message
+    return replace(poles, message="; ".join(filter(None, [of_record, poles.message])))

@@ -172,6 +172,14 @@ def test_what_is_no_band_is_refused_alike_everywhere(recording, band_hz):
             call()
 
 
+def test_a_fault_of_the_record_is_in_the_message_of_its_poles(recording):
+    assert "stands still" not in tr.identify_poles(recording, (200, 300)).message
+    y = recording.y.copy()
+    y[..., -1, 500:560] = y[..., -1, 499, None]
+    held = tr.make_recording(recording.u, y, sample_rate_hz=recording.sample_rate_hz)
+    assert "The sensor stands still for 61 samples" in tr.identify_poles(held, (200, 300)).message
+
+
 def test_a_band_without_lines_is_refused_for_recording_and_response_alike(recording):
     frf = tr.estimate_frf(recording)
     for data in (recording, frf):
