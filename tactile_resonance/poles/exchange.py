@@ -97,8 +97,10 @@ def dispensable(plan: LinesPlan, row: BinData, found: DenseSolution) -> ComplexA
     found : DenseSolution
         Its fit.
     """
-    poles = _poles(plan, found)
+    poles, less = _poles(plan, found), plan.poorer
     above = poles[poles.imag > 0]
+    if less is None:
+        return np.empty(0, complex)
     lines = int(np.isfinite(_variance(plan, row)).sum())
     limit = fall_of_noise(lines) * found.cost / (lines - found.theta.size / 2)
     out = []
@@ -106,7 +108,7 @@ def dispensable(plan: LinesPlan, row: BinData, found: DenseSolution) -> ComplexA
         apart = np.abs(np.delete(above, k).imag - pole.imag)
         if not (apart < abs(pole.real)).any():
             continue
-        without = _minimum_from(plan.poorer, row, _without(poles, k))
+        without = _minimum_from(less, row, _without(poles, k))
         if without is None:
             continue
         there, fit = exchanged(without[0], row, without[1])

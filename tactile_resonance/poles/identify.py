@@ -279,7 +279,16 @@ def _identify(
         dispensable=needed if fit.dispensable is None else fit.dispensable,
         remark=np.full(batch, "", object),
     )
-    return assemble(judged, fit.model, structure, band_hz, shape, method)
+    less = plan.poorer
+    return assemble(
+        judged,
+        fit.model,
+        structure,
+        band_hz,
+        shape,
+        method,
+        None if less is None else lambda rows: less.fit(data.rows(rows)).cost,
+    )
 
 
 def _nothing(plan: LinesPlan, lines: IntArray) -> Judged:

@@ -37,8 +37,7 @@ from tactile_resonance.poles.judgement import assemble
 from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.model_error import COMPARISON, poorer, richer
-from tactile_resonance.poles.result import STATUS_CODE, PolesBatch, PolesStatus
-from tactile_resonance.poles.significance import beside_others, fall_of_noise
+from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
 
@@ -156,39 +155,16 @@ class JointPlan:
     def _poles(self, u: ComplexArray, y: ComplexArray, method: str) -> PolesBatch:
         *shape, records, size = y.shape
         u, y = (values.reshape(-1, records, size) for values in (u, y))
-        judged = fit_records(self, u, y)
-        model = self.model_of(judged.theta)
-        poles = assemble(judged, model, self.structure, self.band_hz, tuple(shape), method)
-        if self.structure.order == 2 or self.poorer is None:
-            return poles
-        return self._with_needed(poles, self.poorer, u, y)
-
-    def _with_needed(
-        self, poles: PolesBatch, less: JointPlan, u: ComplexArray, y: ComplexArray
-    ) -> PolesBatch:
-        """With modes beside others whose residue noise could make, but without which the fit is worse.
-
-        Two modes nearer than their widths share what the records say of them, so that the residue of one may be
-        uncertain, and only a fit without it tells; see `fall_of_noise`.
-
-        Parameters
-        ----------
-        poles : PolesBatch
-        less : JointPlan
-            With one mode less.
-        u, y : (points, M, K) complex
-        """
-        found = poles.significant.reshape(len(y), -1)
-        beside = beside_others(poles.poles_rad_s.reshape(found.shape), found)
-        beside &= poles.status_code.reshape(-1, 1) == STATUS_CODE[PolesStatus.OK]
-        rows = np.flatnonzero(beside.any(axis=-1))
-        if rows.size == 0:
-            return poles
-        fall = less._poles(u[rows], y[rows], poles.method).cost - poles.cost.ravel()[rows]
-        needed = rows[fall > fall_of_noise(poles.lines.ravel()[rows])]
-        found = found.copy()
-        found[needed] |= beside[needed]
-        return replace(poles, significant=found.reshape(poles.significant.shape))
+        judged, less = fit_records(self, u, y), self.poorer
+        return assemble(
+            judged,
+            self.model_of(judged.theta),
+            self.structure,
+            self.band_hz,
+            tuple(shape),
+            method,
+            None if less is None else lambda rows: fit_records(less, u[rows], y[rows]).cost,
+        )
 
     def _checked(self, u: ComplexArray, y: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Bins of both channels, of one shape (..., K)."""
@@ -312,12 +288,9 @@ class JointPlan:
 
     @cached_property
     def poorer(self) -> JointPlan | None:
-        """With one mode less; None where the numerator has no terms to take with it."""
-        try:
-            plan = replace(self, structure=poorer(self.structure), transient_terms=None)
-        except ValueError:
-            return None
-        return plan
+        """With one mode less; None where the model has none to spare."""
+        structure = poorer(self.structure)
+        return None if structure is None else replace(self, structure=structure, transient_terms=None)
 
     def noise_bands(self, records: int) -> NoiseBands:
         """Pieces of the band, for so many records of a point."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -14,7 +15,12 @@ from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.model_error import model_error_factor
 from tactile_resonance.poles.noise_level import KINDS
 from tactile_resonance.poles.result import STATUS_CODE, PolesBatch, PolesStatus
-from tactile_resonance.poles.significance import significant_modes
+from tactile_resonance.poles.significance import (
+    beside_others,
+    fall_of_noise,
+    second_order,
+    significant_modes,
+)
 from tactile_resonance.poles.structure import ModelStructure
 
 # Beyond this the parameters have no figure left in double precision.
@@ -112,6 +118,7 @@ def assemble(
     band_hz: tuple[float, float],
     shape: tuple[int, ...],
     method: str,
+    costs_with_less: Callable[[IntArray], FloatArray] | None = None,
 ) -> PolesBatch:
     """The result of a batch.
 
@@ -125,6 +132,8 @@ def assemble(
     shape : tuple of int
         Leading axes, of as many points as the batch has.
     method : str
+    costs_with_less : callable, optional
+        Costs (rows,) of some points, fitted with one mode less; see `_needed`.
     """
     enough = judged.lines >= structure.fewest_lines
     conditioned = judged.condition < LARGEST_CONDITION_NUMBER
@@ -153,10 +162,16 @@ def assemble(
         for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):
             quantities[name][undetermined] = np.nan
     poles = quantities["poles_rad_s"]
-    significant = significant_modes(model, quantities, covariance, judged.lines)
+    significant, distance = significant_modes(model, quantities, covariance, judged.lines)
     significant &= ~judged.dispensable
     if poles.shape[-1] > 2:
         significant &= ~_sum_of_hidden(poles, significant)
+    if costs_with_less is not None:
+        certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
+        significant |= _needed(judged, structure, poles, significant, certain, costs_with_less)
+    remark = judged.remark
+    if poles.shape[-1] > 1:
+        remark = _widen(quantities, second_order(poles, significant, distance), remark)
     code = np.full(hopeless.shape, STATUS_CODE[PolesStatus.OK], np.uint8)
     with np.errstate(invalid="ignore"):
         # the gravest last, so that it stays
@@ -199,7 +214,7 @@ def assemble(
         band_hz=band_hz,
         variance_model=batch(NAMES[judged.kind]),
         method=method,
-        remark=batch(judged.remark),
+        remark=batch(remark),
     )
 
 
@@ -210,6 +225,53 @@ def _lost_to_rounding(covariance: FloatArray) -> BoolArray:
     """
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     return np.asarray((variances <= 0).any(axis=(-2, -1)))
+
+
+def _needed(
+    judged: Judged,
+    structure: ModelStructure,
+    poles: ComplexArray,
+    found: BoolArray,
+    asked: BoolArray,
+    costs_with_less: Callable[[IntArray], FloatArray],
+) -> BoolArray:
+    """(batch, k) modes beside others whose residue noise could make, but without which the fit is worse.
+
+    Two modes nearer than their widths share what the lines say of them, so that the residue of one may be
+    uncertain, and only a fit without it tells; see `significance.fall_of_noise`.
+    """
+    beside = beside_others(poles, found) & ~judged.dispensable & asked[:, None]
+    rows = np.flatnonzero(beside.any(axis=-1))
+    if rows.size:
+        lines, expected = judged.lines[rows], judged.expected[rows]
+        level = np.maximum(expected / (lines - structure.parameters / 2), 1)
+        fall = costs_with_less(rows) - judged.cost[rows]
+        beside[rows] &= (fall > level * fall_of_noise(lines))[:, None]
+    return beside
+
+
+def _widen(
+    quantities: dict[str, npt.NDArray], variance: FloatArray, remark: npt.NDArray[np.object_]
+) -> npt.NDArray[np.object_]:
+    """Add variances of poles (batch, k) to their total covariance; the remark says of which points."""
+    wide = variance > 0
+    rows = np.flatnonzero(wide.any(axis=-1))
+    if rows.size == 0:
+        return remark
+    total, covariance = quantities["total_covariance"], quantities["covariance"]
+    size = np.abs(quantities["poles_rad_s"][wide])
+    both = np.stack([variance[wide] / (2 * np.pi) ** 2, variance[wide] / size**2], axis=-1)  # of f0, damping
+    known = np.where(np.isfinite(total[wide]), total[wide], covariance[wide])
+    total[wide] = known + both[..., None] * np.eye(2)
+    remark = remark.copy()
+    for k in rows:
+        f0_hz = " and ".join(f"{f0:.4g}" for f0 in quantities["f0_hz"][k][wide[k]])
+        note = (
+            f"the modes at {f0_hz} Hz are nearer than their widths, and how they share the response is "
+            "uncertain: rely on the total covariance"
+        )
+        remark[k] = "; ".join(filter(None, [remark[k], note]))
+    return remark
 
 
 def _sum_of_hidden(poles: ComplexArray, significant: BoolArray) -> BoolArray:

@@ -112,9 +112,10 @@ class LinesPlan:
         return LinesPlan.on_lines(self.frequency_hz, richer(self.structure), self.band_hz)
 
     @property
-    def poorer(self) -> LinesPlan:
-        """With one mode less."""
-        return LinesPlan.on_lines(self.frequency_hz, poorer(self.structure), self.band_hz)
+    def poorer(self) -> LinesPlan | None:
+        """With one mode less; None where the model has none to spare."""
+        less = poorer(self.structure)
+        return None if less is None else LinesPlan.on_lines(self.frequency_hz, less, self.band_hz)
 
     def fit(self, data: BinData) -> LinesFit:
         """Fit of all points of a batch."""

@@ -166,8 +166,9 @@ def richer(structure: ModelStructure) -> ModelStructure:
     )
 
 
-def poorer(structure: ModelStructure) -> ModelStructure:
-    """One mode less, as many residual terms."""
-    return replace(
-        structure, order=structure.order - 2, numerator_order=structure.numerator_order - 2
-    )
+def poorer(structure: ModelStructure) -> ModelStructure | None:
+    """One mode less, as many residual terms; None where the model has none to spare."""
+    order, numerator_order = structure.order - 2, structure.numerator_order - 2
+    if order < 1 or numerator_order < 0:
+        return None
+    return replace(structure, order=order, numerator_order=numerator_order)

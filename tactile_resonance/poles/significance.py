@@ -17,6 +17,8 @@ from tactile_resonance.poles.model import RationalModel
 NOISE_PASSES_FOR_A_MODE = 1e-4
 # Of a mode: natural frequency, damping ratio, and a residue.
 PARAMETERS_OF_A_MODE = 4
+# Squared distance of a residue from zero, in its deviations, beyond which linear propagation is exact enough.
+LINEAR = 100.0
 # A single mode whose damping ratio is known to this part is none of noise's making: its residue is known
 # about as well, ten times better than the test below asks for.
 CERTAIN = 0.02
@@ -27,8 +29,8 @@ def significant_modes(
     quantities: dict[str, npt.NDArray],
     coefficients: FloatArray,
     lines: IntArray,
-) -> BoolArray:
-    """(batch, k) modes that noise alone would not make; those whose covariance is not known are kept.
+) -> tuple[BoolArray, FloatArray]:
+    """Modes that noise alone would not make; those whose covariance is not known are kept.
 
     A fit to noise finds the line or bin that stands out most: the residue's Mahalanobis distance from
     zero, chi-square with two degrees of freedom, is the largest of about as many as there are lines
@@ -42,10 +44,16 @@ def significant_modes(
     coefficients : (batch, n, n) float
         Covariance of the free coefficients; NaN where it is not known.
     lines : (batch,) int
+
+    Returns
+    -------
+    found : (batch, k) bool
+    distance : (batch, k) float
+        The squared distance; NaN where none was needed.
     """
     poles, residues = quantities["poles_rad_s"], quantities["residues"]
     there = np.isfinite(poles)
-    found = there.copy()
+    found, distances = there.copy(), np.full(poles.shape, np.nan)
     modes = poles.shape[-1]
     tested = there & np.isfinite(coefficients[:, :1, 0])
     if modes == 1:
@@ -53,12 +61,13 @@ def significant_modes(
         tested &= ~(variance < (CERTAIN * quantities["damping_ratio"]) ** 2)
     rows = np.flatnonzero(tested.any(axis=-1))
     if rows.size == 0:
-        return found
+        return found, distances
     with np.errstate(all="ignore"):
         sensitivity = model.at((rows,)).residue_sensitivity(poles[rows])  # (rows, k, p)
         distance = squared_distance(
             residues[rows], real_covariance(sensitivity, coefficients[rows])
         )
+    distances[rows] = distance
     limit = -2 * np.log(NOISE_PASSES_FOR_A_MODE / np.maximum(lines[rows], 1))
     found[rows] &= ~(distance < limit[:, None])
     if modes > 1:
@@ -70,7 +79,7 @@ def significant_modes(
                 found[row, near] = _significant_together(
                     residues[row, near], sensitivity[k, near], coefficients[row], int(lines[row])
                 )
-    return found
+    return found, distances
 
 
 def fall_of_noise(lines: npt.ArrayLike) -> FloatArray:
@@ -84,9 +93,36 @@ def fall_of_noise(lines: npt.ArrayLike) -> FloatArray:
 
 def beside_others(poles: ComplexArray, found: BoolArray) -> BoolArray:
     """(batch, k) modes that are not found, nearer to one that is than their widths; poles (batch, k)."""
+    return np.asarray(~found & (_near(poles) & found[:, None, :]).any(axis=-1))
+
+
+@np.errstate(invalid="ignore")
+def second_order(poles: ComplexArray, found: BoolArray, distance: FloatArray) -> FloatArray:
+    """(batch, k) variance of poles in either direction [rad^2/s^2] that linear propagation leaves out.
+
+    Two modes nearer than their widths are known by their sum; how it is shared is as uncertain as the residue
+    that is known less. That moves both poles, by up to their distance: to first order within their
+    covariance, to second order by the square of the residue's relative deviation.
+
+    Parameters
+    ----------
+    poles : (batch, k) complex
+    found : (batch, k) bool
+    distance : (batch, k) float
+        Of `significant_modes`.
+    """
+    pairs = _near(poles) & found[:, :, None] & found[:, None, :] & ~np.eye(found.shape[-1], dtype=bool)
+    least = np.minimum(distance[:, :, None], distance[:, None, :])
+    pairs &= least < LINEAR
+    apart = np.abs(poles[:, :, None] - poles[:, None, :]) / np.maximum(least, 1)
+    return np.asarray(np.sum(np.where(pairs, apart, 0.0) ** 2, axis=-1))
+
+
+def _near(poles: ComplexArray) -> BoolArray:
+    """(batch, k, k) which of poles (batch, k) are nearer to each other than their widths."""
     width = np.abs(poles.real)
     near = np.abs(poles[:, :, None] - poles[:, None, :]) < width[:, :, None] + width[:, None, :]
-    return np.asarray(~found & (near & found[:, None, :]).any(axis=-1))
+    return np.asarray(near)
 
 
 def _neighbours(poles: ComplexArray, there: BoolArray) -> list[IntArray]:
