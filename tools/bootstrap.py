@@ -82,7 +82,6 @@ def set_up() -> None:
     BUILD_STAMP.unlink(missing_ok=True)
     build.build(anew=built.get("base") != build_key["base"])
     write(BUILD_STAMP, build_key)
-    build.compile_fits()
     write(FITS_STAMP, fits_key)
 
 
@@ -123,10 +122,10 @@ def wanted_fits(packages_key: Stamp) -> Stamp:
 
 
 def files(folders: Iterable[str]) -> list[Path]:
-    """All files in some folders of the repository, less what Python and editors leave there."""
+    """All files in some folders of the repository, less what Python, numba and editors leave there."""
     found = (path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file())
-    litter = ("~", ".swp", ".pyc")
-    return sorted(path for path in found if not path.name.endswith(litter))
+    kept = (path for path in found if path.parent.name != "__pycache__")
+    return sorted(path for path in kept if not path.name.endswith(("~", ".swp")))
 
 
 def contents(paths: Iterable[Path]) -> str:

@@ -9,8 +9,9 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from contextlib import AbstractContextManager
 
-from console import LOGS, ROOT, SetupError, run, step
+from console import LOGS, ROOT, SetupError, run, running, step
 from packages import BESIDE, NAMED, PYTHON
 
 BUILD = ROOT / "build"
@@ -68,11 +69,12 @@ def find_compiler(language: str) -> str:
 
 
 def build(anew: bool) -> None:
-    """Build and install with colcon: `anew` from nothing, else on top of the last build."""
+    """Compile the fits; build and install with colcon, `anew` from nothing, else on top of the last build."""
     if anew:
         shutil.rmtree(COLCON_BUILD, ignore_errors=True)
         shutil.rmtree(INSTALL, ignore_errors=True)
-    with step("building messages and commands" + (" (about a minute)" if anew else "")):
+    title = "building messages and commands, compiling the fits" + (" (a minute or two)" if anew else "")
+    with step(title), _compiling():
         # By its module: of a sourced ROS 2 there may be a colcon that is not in .venv/bin.
         colcon = [PYTHON, "-c", "from colcon_core.command import main; raise SystemExit(main())"]
         colcon += ["--log-base", LOGS / "colcon", "build", "--base-paths", ROOT]
@@ -89,9 +91,17 @@ def build(anew: bool) -> None:
 
 def compile_fits() -> None:
     """Compile the kernels of the fits into numba's cache, so that no first use has to."""
-    with step("compiling the fits (about a minute)"):
-        failure = "the fits could not be compiled"
-        run([ROOT / "tools" / "run.sh", "tactile_resonance", "compile"], "kernels.log", failure)
+    with step("compiling the fits (about a minute)"), _compiling():
+        pass
+
+
+def _compiling() -> AbstractContextManager[None]:
+    """Compile them beside the body: they take one core, and none of the messages."""
+    command = [PYTHON, "-m", "tactile_resonance.cli", "compile"]
+    env = _environment()
+    env["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), env.get("PYTHONPATH")]))
+    env["PYTHONPYCACHEPREFIX"] = str(BUILD / "pycache")  # as tools/run.sh
+    return running(command, "kernels.log", "the fits could not be compiled", env)
 
 
 def _environment() -> dict[str, str]:

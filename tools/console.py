@@ -37,10 +37,13 @@ def step(title: str) -> Iterator[None]:
     print(f" {time.monotonic() - start:.1f} s", flush=True)
 
 
-def run(
+@contextmanager
+def running(
     command: Sequence[str | Path], log_name: str, failure: str, env: Mapping[str, str] | None = None
-) -> None:
-    """Run a command from the repository with its output in log/<log_name>.
+) -> Iterator[None]:
+    """Run a command from the repository beside the body, with its output in log/<log_name>; wait for its end.
+
+    Where the body raises, the command is ended.
 
     Raises
     ------
@@ -63,6 +66,7 @@ def run(
             close_fds=False,
         )
         try:
+            yield
             status = process.wait()
         except BaseException:
             with suppress(ProcessLookupError):
@@ -71,6 +75,14 @@ def run(
             raise
     if status != 0:
         raise SetupError(failure, log)
+
+
+def run(
+    command: Sequence[str | Path], log_name: str, failure: str, env: Mapping[str, str] | None = None
+) -> None:
+    """Run a command, and wait for its end: see `running`."""
+    with running(command, log_name, failure, env):
+        pass
 
 
 def last_lines(log: Path) -> str:
