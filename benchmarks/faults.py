@@ -116,14 +116,15 @@ def session(names: Sequence[str]) -> Iterator[Row]:
     while left:
         domain = free_domain_id({})
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        with FaultyScan(Path(mkdtemp()), f"127.0.92.{domain + 1}") as scan:
-            while left:
-                name = left.pop(0)
-                try:
+        name = left.pop(0)
+        try:
+            with FaultyScan(Path(mkdtemp()), f"127.0.92.{domain + 1}") as scan:
+                yield rows[name](scan)
+                while left:
+                    name = left.pop(0)
                     yield rows[name](scan)
-                except (AssertionError, RuntimeError) as error:
-                    yield Row(name, "the scan does not end", wrong=str(error))
-                    break
+        except (AssertionError, RuntimeError) as error:
+            yield Row(name, "the scan does not end, or does not begin", wrong=str(error))
 
 
 def _page(rows: Sequence[Row], left_out: Sequence[str]) -> str:
