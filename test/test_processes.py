@@ -1,13 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which domain nodes are started in, and which of them have ended."""
+"""Which domain nodes are started in, which of them have ended, and threads of a process."""
 
+import ctypes
 import os
 import socket
+import sys
+import threading
 import time
 
 import pytest
 
-from tactile_resonance.processes import NodeProcesses, free_domain_id, hold_domain
+from tactile_resonance.processes import (
+    NodeProcesses,
+    free_domain_id,
+    hold_domain,
+    set_timer_slack,
+    thread_ids,
+)
 
 
 @pytest.mark.parametrize("participant", [0, 3, 119])
@@ -49,3 +58,20 @@ def test_every_node_that_has_ended_is_named_with_its_last_line(tmp_path):
                 told = str(error)
     ended = "ended with exit status -9: cause"
     assert told == f"frf_node {ended}; poles_node {ended}"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the slack of timers is known on Linux")
+def test_a_thread_keeps_the_slack_of_timers_with_which_it_was_started():
+    def slack_ns():
+        return ctypes.CDLL(None).prctl(30)  # PR_GET_TIMERSLACK, linux/prctl.h
+
+    before_ns, threads, found, ends = slack_ns(), thread_ids(), [], threading.Event()
+    set_timer_slack(3_000_000)
+    thread = threading.Thread(target=lambda: ends.wait() and found.append(slack_ns()))
+    thread.start()
+    set_timer_slack(0)
+    assert thread_ids() - threads == {thread.native_id}
+    ends.set()
+    thread.join()
+    assert found == [3_000_000]
+    assert slack_ns() == before_ns

@@ -13,6 +13,7 @@ import pytest
 from arms import DOWN, PATIENCE_S
 
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
+from tactile_resonance.processes import may_take_priority
 
 ACCELERATION_M_S2 = 0.5
 
@@ -127,3 +128,15 @@ def test_client_that_hangs_is_left_to_the_watchdog(moving):
         arm.connect()
     connect_again(robot, arm)
     assert arm.client_pid != client
+
+
+@pytest.mark.skipif(not may_take_priority(20), reason="real-time priority is not permitted")
+def test_of_a_client_with_priority_the_thread_of_the_library_alone_has_none(moving, start_arm):
+    robot, arm = moving
+    arm.close()
+    arm = start_arm(robot.host, simulated=False, realtime_priority=20, max_state_age_s=1.0)
+    arm.connect()
+    first, *others = sorted(map(int, os.listdir(f"/proc/{arm.client_pid}/task")))
+    assert first == arm.client_pid
+    assert os.sched_getscheduler(first) == os.SCHED_FIFO
+    assert [os.sched_getscheduler(thread) for thread in others] == [os.SCHED_OTHER]
