@@ -111,6 +111,15 @@ class ContactLoop:
         waits = self._clock.simulated and self.controller.waits
         self._clock.wait_until(self._next_ns, Demand.NONE if waits else Demand.FAST)
 
+    @property
+    def left_s(self) -> float:
+        """Until the next period is due [s]; below 0 where it is late."""
+        return (self._next_ns - self._clock.now_ns()) * 1e-9
+
+    def hurry(self) -> None:
+        """Let the next period be due now, if it is not yet."""
+        self._next_ns = min(self._next_ns, self._clock.now_ns())
+
     def skip(self) -> None:
         """Leave out the period that is due; the next one begins a period from now."""
         self._next_ns = self._clock.now_ns() + self._period_ns()

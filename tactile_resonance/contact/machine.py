@@ -58,8 +58,8 @@ SAME_RAD = 1e-4
 """Goals turned by less against each other are turned alike: the weight of a dish turns with the tip."""
 
 IDLE_PERIODS = 10
-"""While no contact is under way, only one of so many periods is run: 20 ms, half of what a robot's watchdog of
-25 Hz allows, since in simulated time it is fed once per period."""
+"""While no contact is under way one of so many periods is run, where nothing else is stated: 20 ms, half of what
+a robot's watchdog of 25 Hz allows, since in simulated time it is fed once per period."""
 
 CALM = 2.5
 """Deviations by which the force of a held contact that is calm is off at most, as a mean of some forces."""
@@ -84,6 +84,8 @@ class ContactController:
     calm_periods : int
         While a contact is held on tissue that is still and brings no surprise, one of so many periods is run;
         of a cell that moves with the tip each one is.
+    idle_periods : int
+        The same while no contact is under way.
 
     Attributes
     ----------
@@ -101,10 +103,12 @@ class ContactController:
         *,
         under_sample: bool = False,
         calm_periods: int = 1,
+        idle_periods: int = IDLE_PERIODS,
     ) -> None:
         limits.check(parameters)
         self._tip, self._under_sample = tip, under_sample
         self._calm_periods = calm_periods if under_sample else 1
+        self._idle_periods = idle_periods
         self.parameters, self.limits = parameters, limits
         self.state = State.IDLE
         self.goal: ContactGoal | None = None
@@ -301,7 +305,7 @@ class ContactController:
     @property
     def periods(self) -> int:
         """After so many periods the next cycle is due."""
-        return IDLE_PERIODS if self.state is State.IDLE else self._stride
+        return self._idle_periods if self.state is State.IDLE else self._stride
 
     def _is_calm(self) -> bool:
         """Whether a contact is held on tissue that is still, and brings no surprise."""

@@ -170,6 +170,7 @@ class ContactNode(ManagedNode):
             self._tip,
             self._on_cycle,
             self._news.trigger,
+            self._topics.period_s,
         )
         self._teller.reset()
 

@@ -13,7 +13,7 @@ from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import ForceError, Mount, NodeArm
 from tactile_resonance.contact.loop import ContactLoop, Cycle
-from tactile_resonance.contact.machine import ContactController
+from tactile_resonance.contact.machine import IDLE_PERIODS, ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.tip_force import TipForce
 
@@ -28,6 +28,8 @@ END_WITHIN_S = 3.0
 SOURCE_AGAIN_NS = 250_000_000
 # A contact that is held and calm is looked at in one of so many periods.
 CALM_PERIODS = 2
+# While nothing is under way the loop runs as often as is published, at least once in so many periods: 40 ms.
+MOST_IDLE_PERIODS = 20
 
 
 class _EndedError(Exception):
@@ -47,6 +49,8 @@ class ContactThread:
         Called with each cycle in the loop's thread; must return at once.
     failed : callable
         Called in that thread where the loop has ended with an error.
+    told_s : float
+        Time between two cycles that the listener needs while nothing is under way [s].
 
     Attributes
     ----------
@@ -67,6 +71,7 @@ class ContactThread:
         tip: TipGeometry,
         listener: Callable[[Cycle], None],
         failed: Callable[[], None],
+        told_s: float = 0.0,
     ) -> None:
         self.error: Exception | None = None
         self.moves = ""
@@ -74,16 +79,20 @@ class ContactThread:
         self._lock = threading.Condition()
         self._running = True
         self._connecting = False  # meanwhile the arm is another thread's, and the loop stands
+        self._asked = threading.Event()  # something was, which an idle loop is to hear at once
         self._time_passed = False  # simulated time has gone on while the loop waited for the lock
         self._source_tried_ns: int | None = None
         self._alive_s = time.monotonic()
         self._led = arm.led_clock(force.cell, self._stay)
         self.clock: Clock = self._led or arm.clock
+        idle_periods = min(MOST_IDLE_PERIODS, int(told_s / parameters.period_s))
         self.controller = ContactController(
             *(parameters, limits, tip),
             under_sample=force.info.mount is Mount.TABLE,
             # simulated time ends where a block does, and a block waits for the force at its end
             calm_periods=1 if self.clock.simulated else CALM_PERIODS,
+            # simulated time needs no haste, and there the arm's watchdog is fed once a period
+            idle_periods=IDLE_PERIODS if self.clock.simulated else max(IDLE_PERIODS, idle_periods),
         )
         self.loop = ContactLoop(arm, force, self.clock, self.controller, listener)
         self._thread = threading.Thread(target=self._run, name="contact", daemon=True)
@@ -109,13 +118,13 @@ class ContactThread:
         with self._lock:
             self.controller.configure(parameters, limits)
             self.loop.start(goal)
-        self._hurry()
+            self._hurry()
 
     def retract(self) -> None:
         """Draw the tip back, beginning with the next cycle."""
         with self._lock:
             self.controller.retract()
-        self._hurry()
+            self._hurry()
 
     def tell_touch(self) -> bool:
         """Pass on that another sensor has detected the first contact; whether that is new in an approach."""
@@ -149,8 +158,8 @@ class ContactThread:
         if self._lock.acquire(timeout=RETRACT_WITHIN_S):  # a loop that hangs may hold it
             self._lock.wait_for(lambda: not self._connecting, RETRACT_WITHIN_S)
             self.controller.retract()
-            self._lock.release()
             self._hurry()
+            self._lock.release()
         while self._thread.is_alive() and time.monotonic() < deadline:
             if self.controller.settled:
                 break
@@ -162,8 +171,20 @@ class ContactThread:
         return not self._thread.is_alive()
 
     def _hurry(self) -> None:
+        """Let the loop's next period begin now; with the lock."""
         if self._led is not None:
             self._led.hurry()
+        elif not self.clock.simulated:
+            self.loop.hurry()
+            self._asked.set()
+
+    def _wait(self) -> None:
+        """Wait for the loop's next period; a loop that is idle hears at once what is asked of it."""
+        if self.clock.simulated or self.controller.state is not State.IDLE:
+            self.loop.wait()
+        else:
+            self._asked.wait(self.loop.left_s)
+            self._asked.clear()
 
     def _stay(self) -> None:
         """Called while simulated time stands."""
@@ -183,7 +204,7 @@ class ContactThread:
     def _run(self) -> None:
         try:
             while self._running:
-                self.loop.wait()
+                self._wait()
                 with self._lock:
                     while self._connecting:
                         self._lock.wait()

@@ -33,13 +33,18 @@ class ContactTopics:
         Of the tip, of its poses.
     rate_hz : float
         By the loop's clock.
+
+    Attributes
+    ----------
+    period_s : float
+        Between two messages [s].
     """
 
     def __init__(
         self, node: ManagedNode, stop: StopInput, frame_id: str, base_frame: str, rate_hz: float
     ) -> None:
         self._stop = stop
-        self._node, self._period_ns = node, round(1e9 / rate_hz)
+        self._node, self.period_s, self._period_ns = node, 1 / rate_hz, round(1e9 / rate_hz)
         self._frame_id, self._base_frame = frame_id, base_frame
         self._wrench = node.publish_on(WrenchStamped, "wrench", STREAM)
         self._pose = node.publish_on(PoseStamped, "tcp_pose", STREAM)

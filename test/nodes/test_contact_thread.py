@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_resonance.clock import WallClock
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.interfaces import ArmFault
 from tactile_resonance.contact.loop import MOST_STOPS
@@ -40,10 +41,10 @@ class Rig:
     waits_for = ""
     tip_in_tool = Pose.at_origin()
 
-    def __init__(self):
+    def __init__(self, clock=None, told_s=0.0):
         made = contact()
         self.bench, self.goal, self._arm = made.bench, made.goal, made.bench.arm
-        self.clock = self.bench.clock
+        self.clock = clock or self.bench.clock
         self.stops = self.states = self.unheard = 0
         self.on_the_way = lambda: None
         self.closed, self.failed = False, threading.Event()
@@ -51,7 +52,7 @@ class Rig:
         self.connect_now.set()
         self.states_while_connecting = 0
         self.thread = ContactThread(
-            self, self.bench.force, QUICK, Limits(), None, self._listen, self.failed.set
+            self, self.bench.force, QUICK, Limits(), None, self._listen, self.failed.set, told_s
         )
 
     def begin(self):
@@ -169,6 +170,19 @@ def test_a_loop_that_hangs_is_given_up_and_its_arm_closed(monkeypatch):
     assert not rig.thread._thread.is_alive()
     assert rig.thread.loop.cycles == moved[1]
     assert rig.speed_m_s == pytest.approx(0, abs=5e-3)
+
+
+def test_a_goal_begins_at_once_however_seldom_an_idle_loop_looks(monkeypatch):
+    monkeypatch.setattr(contact_thread, "MOST_IDLE_PERIODS", 10**8)
+    rig = Rig(WallClock(), told_s=2e5)
+    loop = rig.thread.loop
+    deadline = time.monotonic() + HANGS_S
+    while loop.left_s < 1e5:  # after its first cycle
+        assert time.monotonic() < deadline
+        time.sleep(1e-4)
+    rig.begin()
+    rig.until(State.FAULT)  # the states of an arm on another clock are of another time
+    assert within_reason(rig.thread.close)
 
 
 def test_a_loop_that_is_ended_in_contact_draws_back_and_leaves_the_arm_at_rest():
