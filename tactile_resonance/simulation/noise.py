@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tactile_resonance._typing import FloatArray
+
 Seed = int | Sequence[int] | np.random.SeedSequence | np.random.Generator
 """What ``numpy.random.default_rng`` takes; a generator is drawn from as it is."""
 
@@ -29,11 +31,11 @@ class NormalRows:
     def __init__(self, seed: Seed, rms: Sequence[float]) -> None:
         self._random = np.random.default_rng(seed)
         self._rms = np.array(rms)  # (width,)
-        self._left: list[tuple[float, ...]] = []  # the next row last
+        self._left: list[FloatArray] = []  # the next row last
 
-    def take(self) -> tuple[float, ...]:
-        """Return the next row."""
+    def take(self) -> FloatArray:
+        """Return the next row, (width,)."""
         if not self._left:
             numbers = self._rms * self._random.standard_normal((ROWS, self._rms.size))
-            self._left = [tuple(row) for row in reversed(numbers.tolist())]
+            self._left = [*reversed(numbers)]
         return self._left.pop()

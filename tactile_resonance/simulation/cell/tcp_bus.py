@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 import time
 from abc import abstractmethod
+from binascii import hexlify
 from collections.abc import Callable, Iterable
 from typing import ClassVar
 
@@ -148,7 +149,7 @@ class _SocketcandClient(BusClient):
     @staticmethod
     def text_of(frame: CanFrame, epoch_s: float) -> bytes:
         """As it is sent, with its time."""
-        text = frame.data.hex().upper().encode()
+        text = hexlify(frame.data).upper()
         return b"< frame %03X %.6f %s >" % (frame.can_id, epoch_s + frame.time_s, text)
 
     def understand(self, message: bytes) -> None:

@@ -122,7 +122,7 @@ AXES = np.dtype(
 
 @njit(
     UniTuple(int64, 7)(
-        *(from_dtype(AXES)[::1], *[UniTuple(float64, 6)] * 2, float64, UniTuple(float64, 6)),
+        *(from_dtype(AXES)[::1], *[UniTuple(float64, 6)] * 2, float64, float64[::1]),
         *(*[float64] * 3, boolean, float64, boolean),
     ),
     cache=True,

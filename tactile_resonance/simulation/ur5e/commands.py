@@ -326,7 +326,7 @@ class SettingCommands:
 
     def actual_forward(self) -> None:
         """Actual pose of the TCP."""
-        self._script.answer_doubles(pose_from_transform(self._machine.tcp))
+        self._script.answer_doubles(self._machine.tcp_pose)
 
     def forward(self) -> None:
         """Pose of a TCP at joint angles."""

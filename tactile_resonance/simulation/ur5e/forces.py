@@ -141,7 +141,7 @@ class FtSensor:
         return _at_tcp(self._free, self._zero, flange, tcp_m)
 
 
-@njit(_6(float64[::1], float64[::1], UniTuple(float64, 12), _6, float64), cache=True)
+@njit(_6(float64[::1], float64[::1], float64[::1], _6, float64), cache=True)
 def _read(drift, offset, noise, true, keep):
     """Let the drift go on for a cycle, and return what the sensor reads."""
     for k in range(6):

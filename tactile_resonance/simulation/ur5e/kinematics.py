@@ -130,13 +130,15 @@ class Posture:
         numbers = _posture(q)
         self.flange: Transform = numbers[:9], numbers[9:12]
         self._numbers = numbers[12:]
-        self._tools: dict[Transform, Transform] = {IDENTITY: self.flange}
+        self._tools: list[tuple[Transform, Transform]] = [(IDENTITY, self.flange)]
 
     def tool(self, tcp: Transform) -> Transform:
         """Return a frame that the flange carries, in the base; each is computed once."""
-        tool = self._tools.get(tcp)
-        if tool is None:
-            tool = self._tools[tcp] = product(self.flange, tcp)
+        for known, tool in self._tools:
+            if known is tcp:
+                return tool
+        tool = product(self.flange, tcp)
+        self._tools.append((tcp, tool))
         return tool
 
     def twist(self, point_m: Vector, qd: Six) -> Six:

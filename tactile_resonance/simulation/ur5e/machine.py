@@ -25,6 +25,7 @@ from tactile_resonance.simulation.ur5e.forces import (
 )
 from tactile_resonance.simulation.ur5e.kinematics import Posture
 from tactile_resonance.simulation.ur5e.poses import (
+    IDENTITY,
     ORIGIN,
     ZERO,
     Six,
@@ -32,6 +33,7 @@ from tactile_resonance.simulation.ur5e.poses import (
     difference,
     largest,
     moved_wrench,
+    pose_from_transform,
     rounded,
     total,
     transform_from_pose,
@@ -212,6 +214,7 @@ class Machine:
         self.external_wrench = ZERO
         self.tcp_force = ZERO
         self._tip = transform_from_pose(config.tip_in_flange)
+        self._posed = (IDENTITY, ZERO)  # of which TCP the pose was asked for last, and it
         self._rest_cycles = 0
         self._history: deque[tuple[Six, Six]] = deque(maxlen=HISTORY)
         self._observe()
@@ -227,8 +230,17 @@ class Machine:
         return self.posture.tool(self.target.tcp)
 
     @property
+    def tcp_pose(self) -> Six:
+        """Its pose."""
+        if self._posed[0] is not self.tcp:  # an arm at rest has the same one
+            self._posed = self.tcp, pose_from_transform(self.tcp)
+        return self._posed[1]
+
+    @property
     def tcp_twist(self) -> Six:
         """Actual twist of the TCP in the base [m/s, rad/s]."""
+        if self.joints.qd is ZERO:
+            return ZERO
         return self.posture.twist(self.tcp[1], self.joints.qd)
 
     @property

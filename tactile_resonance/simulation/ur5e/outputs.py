@@ -152,7 +152,7 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
     "actual_current": ("VECTOR6D", lambda o: _currents(o.actual_moment)),
     "actual_current_as_torque": ("VECTOR6D", lambda o: o.actual_moment),
     "joint_control_output": ("VECTOR6D", lambda o: _currents(o.actual_moment)),
-    "actual_TCP_pose": ("VECTOR6D", lambda o: pose_from_transform(o.robot.machine.tcp)),
+    "actual_TCP_pose": ("VECTOR6D", lambda o: o.robot.machine.tcp_pose),
     "actual_TCP_speed": ("VECTOR6D", lambda o: o.robot.machine.tcp_twist),
     "actual_TCP_force": ("VECTOR6D", lambda o: o.robot.machine.tcp_force),
     "target_TCP_pose": ("VECTOR6D", lambda o: o.robot.machine.target.pose),

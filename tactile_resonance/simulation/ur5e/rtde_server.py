@@ -104,11 +104,11 @@ class Layout:
     def pack(self, recipe: int, values: Sequence[Any]) -> bytes:
         """Return a data packet; a vector is a sequence of its length."""
         flat: list[Any] = []
-        for value in values:
-            if isinstance(value, (tuple, list)):
-                flat += value
-            else:
+        for value, length in zip(values, self._lengths, strict=True):
+            if length == 1:
                 flat.append(value)
+            else:
+                flat += value
         return self._packet.pack(self._packet.size, Kind.DATA, recipe, *flat)
 
     def unpack(self, payload: bytes) -> list | None:

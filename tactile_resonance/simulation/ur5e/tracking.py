@@ -115,7 +115,7 @@ class Jitter:
         return _tremble(self._state, self._by, self._rows.take())
 
 
-@njit(UniTuple(float64, 3)(float64[:, ::1], float64[:, ::1], UniTuple(float64, 6)), cache=True)
+@njit(UniTuple(float64, 3)(float64[:, ::1], float64[:, ::1], float64[::1]), cache=True)
 def _tremble(state, by, noise):
     """Advance place and speed of three axes; return the place."""
     for k in range(3):
