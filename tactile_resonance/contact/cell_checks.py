@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from operator import sub
 
 import numpy as np
 
@@ -128,8 +127,11 @@ class CellChecks:
         if not math.isfinite(sum(wrench)):
             axis = next(k for k, value in enumerate(wrench) if not math.isfinite(value))
             raise ForceError(ForceFault.INVALID, f"{_AXES[axis]} is not finite: {wrench[axis]}")
-        most_n, most_nm, force, torque = self._range_n, self._range_nm, wrench[:3], wrench[3:]
-        over = overload or max(map(abs, force)) > most_n or max(map(abs, torque)) > most_nm
+        # written out: this is done for every wrench
+        (fx, fy, fz, tx, ty, tz), most_n, most_nm = wrench, self._range_n, self._range_nm
+        good = -most_n <= fx <= most_n and -most_n <= fy <= most_n and -most_n <= fz <= most_n
+        good = good and -most_nm <= tx <= most_nm and -most_nm <= ty <= most_nm
+        over = overload or not (good and -most_nm <= tz <= most_nm)
         self._over = self._over + 1 if over else 0
         if over and self._over >= self._limits.overload_samples:
             ranges = (*[most_n] * 3, *[most_nm] * 3)
@@ -146,7 +148,7 @@ class CellChecks:
         self._equal = self._equal + 1 if wrench == last else 0
         if self._equal + 1 >= self._stuck_at:
             raise ForceError(ForceFault.STUCK, f"{self._equal + 1} samples are equal on all axes")
-        largest = max(map(abs, map(sub, force, last)))
+        largest = max(abs(fx - last[0]), abs(fy - last[1]), abs(fz - last[2]))
         if largest > self._limits.jump_n and not over:
             raise ForceError(
                 ForceFault.JUMP,

@@ -60,7 +60,7 @@ class CanWrench:
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._bus: Bus | None = None
         self._fault: ForceError | None = None
-        self._stamped = config.stamps == "adapter"
+        self._stamped, self._latency_ns = config.stamps == "adapter", round(config.latency_s * 1e9)
         self._scale = [tuple(map(float, row)) for row in config.scale]
         diagonal = [row[k] for k, row in enumerate(self._scale)]
         crosstalk = sum(map(abs, sum(self._scale, ()))) > sum(map(abs, diagonal))
@@ -333,7 +333,7 @@ class CanWrench:
         if 0 <= self._stamp_before_ns - stamp_ns < STEP_S * 1e9:
             stamp_ns = self._stamp_before_ns + 1
         self._stamp_before_ns = stamp_ns
-        return stamp_ns - round(self._config.latency_s * 1e9)
+        return stamp_ns - self._latency_ns
 
 
 def _frames(bus: Bus) -> list[Frame]:
