@@ -28,16 +28,17 @@ from tactile_resonance.poles.basis import (
     default_transient_terms,
     transient_basis,
 )
-from tactile_resonance.poles.covariance import modes_in_band, pole_quantities
+from tactile_resonance.poles.covariance import modes_in_band
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import minimise
+from tactile_resonance.poles.fit import Solution, minimise
 from tactile_resonance.poles.joint_fit import fit_records
 from tactile_resonance.poles.joint_noise import NoiseBands
 from tactile_resonance.poles.judgement import assemble
 from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON, poorer, richer
+from tactile_resonance.poles.model_error import COMPARISON, poles_and_covariance, poorer, richer
 from tactile_resonance.poles.result import PolesBatch
+from tactile_resonance.poles.split import best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
 
@@ -343,22 +344,28 @@ class JointPlan:
         roots = self.denominator_basis.roots(self.problem.split(theta)[0])
         return modes_in_band(self.variable.to_s(roots)[0], self.band_hz)
 
-    def compared(
-        self, data: BinData, start: FloatArray | None = None
-    ) -> tuple[ComplexArray, FloatArray | None]:
-        """Poles (points, places) of a fit that others are compared with, and their covariance.
+    def compared(self, data: BinData, start: FloatArray | None = None) -> ComplexArray:
+        """Poles (points, places) of a fit of few iterations that others are compared with."""
+        return self.poles_in_band(minimise(self.problem, data, start, COMPARISON).theta[:, 0])
 
-        The latter (points, places, 2, 2) is that of (f0_hz, damping_ratio), of one record each.
-        """
-        solution = minimise(self.problem, data, start, COMPARISON)
-        theta = solution.theta[:, 0]
-        if data.records > 1:
-            return self.poles_in_band(theta), None
-        inverse = solution.marginal[:, 0]
-        dof = max(data.undriven + data.driven - inverse.shape[-1] / 2, 1)
-        covariance = inverse * (solution.cost / (2 * dof))[:, None, None]
-        quantities, _ = pole_quantities(self.model_of(theta), self.band_hz, covariance)
-        return quantities["poles_rad_s"], quantities["covariance"]
+    def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
+        """Poles of a fit and their covariance; see `model_error.poles_and_covariance`."""
+        solution = minimise(self.problem, data)
+        poles, covariance, lost = self._with_covariance(data, solution)
+        rows = np.flatnonzero(lost)
+        if rows.size:  # where noise took a mode, two may be behind the other one
+            part, again = data.rows(rows), solution.rows(rows)
+            again = best_of_split(self.problem, part, self.model_of(again.theta[:, 0]), again)
+            poles[rows], covariance[rows], _ = self._with_covariance(part, again)
+        return poles, covariance
+
+    def _with_covariance(
+        self, data: BinData, solution: Solution
+    ) -> tuple[ComplexArray, FloatArray, BoolArray]:
+        a, b, own = self.problem.sizes
+        dof = data.records * (data.undriven + data.driven - own / 2) - (a + b) / 2
+        model = self.model_of(solution.theta[:, 0])
+        return poles_and_covariance(model, solution.marginal[:, 0], solution.cost, dof)
 
     @property
     def _between(self) -> BoolArray:

@@ -26,6 +26,7 @@ from tactile_resonance.poles.model_error import systematic_of
 from tactile_resonance.poles.noise_level import are_flat
 from tactile_resonance.poles.realisations_spread import Spread
 from tactile_resonance.poles.scatter import Pieces, smooth_variance
+from tactile_resonance.poles.split import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
@@ -204,6 +205,9 @@ def _fit(
         variance_y = np.where(noise[:, :1] > TINY, noise[:, :1], 1.0)
         data = plain.weighted(rest=variance_y, variance_y=variance_y, variance_u=noise[:, 1:])
     refit_failed(plan.problem, solution, data)
+    if plan.structure.order >= SEVERAL_MODES:
+        model = plan.model_of(solution.theta[:, 0])
+        solution = best_of_split(plan.problem, data, model, solution)
     last = not _returns(plan, plain.records)
     judge = _several if plain.records > 1 else partial(_alone, last=last)
     judged = judge(_Round(plan, plain, data, solution, noise, np.zeros(len(y), np.int64)))

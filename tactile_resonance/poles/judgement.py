@@ -251,18 +251,15 @@ def _needed(
 
 
 def _widen(
-    quantities: dict[str, npt.NDArray], variance: FloatArray, remark: npt.NDArray[np.object_]
+    quantities: dict[str, npt.NDArray], more: FloatArray, remark: npt.NDArray[np.object_]
 ) -> npt.NDArray[np.object_]:
-    """Add variances of poles (batch, k) to their total covariance; the remark says of which points."""
-    wide = variance > 0
+    """Add more (batch, k, 2, 2) to the total covariance; the remark says of which points."""
+    wide = more[..., 0, 0] > 0
     rows = np.flatnonzero(wide.any(axis=-1))
     if rows.size == 0:
         return remark
     total, covariance = quantities["total_covariance"], quantities["covariance"]
-    size = np.abs(quantities["poles_rad_s"][wide])
-    both = np.stack([variance[wide] / (2 * np.pi) ** 2, variance[wide] / size**2], axis=-1)  # of f0, damping
-    known = np.where(np.isfinite(total[wide]), total[wide], covariance[wide])
-    total[wide] = known + both[..., None] * np.eye(2)
+    total[wide] = np.where(np.isfinite(total), total, covariance)[wide] + more[wide]
     remark = remark.copy()
     for k in rows:
         f0_hz = " and ".join(f"{f0:.4g}" for f0 in quantities["f0_hz"][k][wide[k]])

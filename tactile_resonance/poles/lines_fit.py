@@ -27,7 +27,7 @@ from tactile_resonance.poles.fit import (
     minimise,
 )
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON, poorer, richer
+from tactile_resonance.poles.model_error import COMPARISON, poles_and_covariance, poorer, richer
 from tactile_resonance.poles.split import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
@@ -147,7 +147,7 @@ class LinesPlan:
         )
 
     @np.errstate(over="ignore", invalid="ignore")
-    def compared(self, data: BinData, _: FloatArray | None = None) -> tuple[ComplexArray, None]:
+    def compared(self, data: BinData, _: FloatArray | None = None) -> ComplexArray:
         """Poles (batch, places) in the band of a fit that others are compared with; see `JointPlan`.
 
         Of the batched solver alone where it is that of `fit`, and of few iterations.
@@ -157,7 +157,14 @@ class LinesPlan:
         else:
             theta = minimise(self.problem, data, None, COMPARISON).theta
             model = self.model_of(theta[:, 0])
-        return modes_in_band(model.poles_rad_s(), self.band_hz), None
+        return modes_in_band(model.poles_rad_s(), self.band_hz)
+
+    def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
+        """Poles of a fit and their covariance; see `model_error.poles_and_covariance`."""
+        fit = self.fit(data)
+        dof = data.driven - self.structure.parameters / 2
+        inverse = 2 * fit.covariance
+        return poles_and_covariance(fit.model, inverse, fit.cost, dof)[:2]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:

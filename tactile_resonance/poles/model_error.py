@@ -8,10 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_resonance._typing import ComplexArray, FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance.poles.covariance import pole_quantities
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import RULES
+from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.result import natural_frequency_and_damping
+from tactile_resonance.poles.significance import (
+    beside_others,
+    in_any_direction,
+    second_order,
+    significant_modes,
+)
 from tactile_resonance.poles.structure import ModelStructure
 
 if TYPE_CHECKING:
@@ -33,7 +41,9 @@ def systematic_of(
 ) -> FloatArray:
     """Outer products of what halves of the data, and one mode more, move each pole by.
 
-    Halves are those of the driven bins and, of several records, the first and the last ones.
+    Halves are those of the driven bins and, of several records, the first and the last ones. Where one of
+    these fits has no such mode, or does not determine it, half its width stands for all: what lies nearer to a
+    mode looks like part of it.
 
     Parameters
     ----------
@@ -53,17 +63,19 @@ def systematic_of(
     for parity in (0, 1):
         left_out = np.arange(data.driven) % 2 == parity
         half = data.weighted(variance_y=np.where(left_out, np.inf, data.variance_y))
-        poles.append(plan.compared(half, theta)[0])
+        poles.append(plan.compared(half, theta))
     systematic = difference_of_halves(*poles)
     half_of = data.records // 2
     if half_of > 0 and theta is not None:
         first, last = slice(0, half_of), slice(data.records - half_of, None)
-        poles = [plan.compared(data.part(which), theta[:, which])[0] for which in (first, last)]
+        poles = [plan.compared(data.part(which), theta[:, which]) for which in (first, last)]
         systematic = systematic + difference_of_halves(*poles)
     if plan.richer is not None and _fewest_lines(data) > plan.richer.structure.fewest_lines:
-        more = difference_of_models(poles_rad_s, *plan.richer.compared(data))
+        more = difference_of_models(poles_rad_s, *plan.richer.with_covariance(data))
         systematic = systematic + more
-    return systematic
+    half_width = in_any_direction(np.abs(poles_rad_s.real), poles_rad_s)
+    known = np.isfinite(systematic).all(axis=(-2, -1), keepdims=True)
+    return np.where(known, systematic, half_width)
 
 
 def _fewest_lines(data: BinData) -> int:
@@ -130,7 +142,7 @@ def difference_of_halves(even_rad_s: ComplexArray, odd_rad_s: ComplexArray) -> F
 
 
 def difference_of_models(
-    poles_rad_s: ComplexArray, richer_rad_s: ComplexArray, covariance: FloatArray | None = None
+    poles_rad_s: ComplexArray, richer_rad_s: ComplexArray, covariance: FloatArray
 ) -> FloatArray:
     """Outer product of what a model with one mode more moves each pole by in (f0_hz, damping_ratio).
 
@@ -142,21 +154,53 @@ def difference_of_models(
     poles_rad_s : (..., places) complex
     richer_rad_s : (..., more places) complex
         NaN where there is no mode; the nearest one counts.
-    covariance : (..., more places, 2, 2) float, optional
+    covariance : (..., more places, 2, 2) float
         Of (f0_hz, damping_ratio) of the latter.
 
     Returns
     -------
     (..., places, 2, 2) float
-        With the covariance of the nearest one, where given; 0 where the richer model has no mode.
+        With the covariance of the nearest one; NaN where the richer model has or determines no mode.
     """
     distance = np.abs(richer_rad_s[..., None, :] - poles_rad_s[..., None])  # (..., places, more)
     nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
     other = np.take_along_axis(richer_rad_s, nearest, axis=-1)
     moved = difference_of_halves(poles_rad_s, other)
-    if covariance is not None:
-        moved = moved + np.take_along_axis(covariance, nearest[..., None, None], axis=-3)
-    return np.nan_to_num(moved)
+    return np.asarray(moved + np.take_along_axis(covariance, nearest[..., None, None], axis=-3))
+
+
+def poles_and_covariance(
+    model: RationalModel, inverse: FloatArray, cost: FloatArray, dof: float
+) -> tuple[ComplexArray, FloatArray, BoolArray]:
+    """Poles of a fit, in the band or not, and their covariance as its residuals show it.
+
+    Parameters
+    ----------
+    model : RationalModel
+    inverse : (points, n, n) float
+        Of the normal matrix.
+    cost : (points,) float
+    dof : float
+        Complex degrees of freedom of the residuals.
+
+    Returns
+    -------
+    poles : (points, places) complex
+    covariance : (points, places, 2, 2) float
+        Of (f0_hz, damping_ratio); NaN where the data do not determine the mode.
+    lost : (points,) bool
+        Where a mode is none, or noise makes it and it is not beside another one.
+    """
+    covariance = inverse * (cost / (2 * max(dof, 1)))[:, None, None]
+    quantities, _ = pole_quantities(model, (0.0, np.inf), covariance)
+    poles = quantities["poles_rad_s"]
+    lines = np.full(cost.size, max(int(dof), 1))
+    found, distance = significant_modes(model, quantities, covariance, lines)
+    in_f0 = quantities["covariance"]
+    in_f0[~((np.linalg.det(in_f0) > 0) & (in_f0[..., 0, 0] > 0))] = np.nan  # lost to rounding
+    more = second_order(poles, np.isfinite(poles), distance)
+    lost = np.asarray((~found & ~beside_others(poles, found)).any(axis=-1))
+    return poles, in_f0 + more, lost
 
 
 def richer(structure: ModelStructure) -> ModelStructure:

@@ -96,9 +96,9 @@ def beside_others(poles: ComplexArray, found: BoolArray) -> BoolArray:
     return np.asarray(~found & (_near(poles) & found[:, None, :]).any(axis=-1))
 
 
-@np.errstate(invalid="ignore")
+@np.errstate(invalid="ignore", divide="ignore")
 def second_order(poles: ComplexArray, found: BoolArray, distance: FloatArray) -> FloatArray:
-    """(batch, k) variance of poles in either direction [rad^2/s^2] that linear propagation leaves out.
+    """(batch, k, 2, 2) covariance of (f0_hz, damping_ratio) that linear propagation leaves out; 0 mostly.
 
     Two modes nearer than their widths are known by their sum; how it is shared is as uncertain as the residue
     that is known less. That moves both poles, by up to their distance: to first order within their
@@ -115,7 +115,16 @@ def second_order(poles: ComplexArray, found: BoolArray, distance: FloatArray) ->
     least = np.minimum(distance[:, :, None], distance[:, None, :])
     pairs &= least < LINEAR
     apart = np.abs(poles[:, :, None] - poles[:, None, :]) / np.maximum(least, 1)
-    return np.asarray(np.sum(np.where(pairs, apart, 0.0) ** 2, axis=-1))
+    both = np.linalg.norm(np.where(pairs, apart, 0.0), axis=-1)
+    return np.nan_to_num(in_any_direction(both, poles))
+
+
+def in_any_direction(std: FloatArray, poles: ComplexArray) -> FloatArray:
+    """(..., 2, 2) covariance of (f0_hz, damping_ratio) of poles (...) as uncertain [rad/s] in any direction."""
+    out = np.zeros((*poles.shape, 2, 2))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        out[..., 0, 0], out[..., 1, 1] = (std / (2 * np.pi)) ** 2, (std / np.abs(poles)) ** 2
+    return out
 
 
 def _near(poles: ComplexArray) -> BoolArray:

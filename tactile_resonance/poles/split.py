@@ -7,6 +7,8 @@ there: the cost has a minimum with a single mode for both, and the other one fit
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
@@ -19,6 +21,9 @@ from tactile_resonance.poles.tables import Problem
 SEVERAL_MODES = 4
 """Order from which on a model has more than one mode."""
 
+LEAST_FALL = 4.0
+"""Of the cost, in units of the noise, that a start must bring: less is another mode on noise, not one more."""
+
 APART = 0.7
 """Natural frequencies of the two, from that of the one, over its half width."""
 
@@ -30,7 +35,7 @@ def best_of_split(
     solution: Solution,
     rules: Rules = RULES,
 ) -> Solution:
-    """The solution, or that from a start with its highest peak split, whichever costs less.
+    """The solution, or that from a start with its highest peak split where it costs less than noise explains.
 
     Parameters
     ----------
@@ -47,10 +52,14 @@ def best_of_split(
     if not rows.size:
         return solution
     again = minimise(problem, data.rows(rows), start[rows], rules)
+    dof = data.records * (data.undriven + data.driven) - sum(problem.sizes) / 2
+    fall = LEAST_FALL / max(dof, LEAST_FALL)
     better = again.converged & (
-        ~solution.converged[rows] | (again.cost < solution.cost[rows] * (1 - 1e-9))
+        ~solution.converged[rows] | (again.cost < solution.cost[rows] * (1 - fall))
     )
-    solution.put(rows[better], again.rows(better))
+    rows = rows[better]
+    kept = replace(again.rows(better), noise=solution.noise[rows], plain=solution.plain[rows])
+    solution.put(rows, kept)
     return solution
 
 

@@ -90,7 +90,7 @@ def test_modes_that_noise_hides_are_judged_whatever_the_numerator(numerator_orde
     noise = np.random.default_rng(2).standard_normal((50, u.size, 2)).view(complex)[..., 0]
     result = plan.from_bins(u, y - 0.1 * u + 0.5 / np.sqrt(2 * SAMPLES * PERIODS) * noise)
     # noise of this size leaves no more than one of them certain
-    assert result.significant.all(axis=-1).mean() < 0.1
+    assert result.significant.all(axis=-1).mean() < 0.2
 
 
 LINES_HZ, RUNS = np.arange(200.0, 300.1, 2.5), 300
@@ -150,3 +150,47 @@ def test_noise_beside_a_mode_is_none(order):
 def test_many_modes_of_an_frf_are_judged_whatever_the_numerator(numerator_order):
     found, _ = responses(8, numerator_order, 0, 1e-2)
     assert not found.has_status(PolesStatus.FAILED).any()
+
+
+@pytest.mark.parametrize(("apart_hz", "noise"), [(1, 1e-3), (1, 3e-3), (2, 0.01), (4, 0.03)])
+@pytest.mark.parametrize("numerator_order", [2, 7])
+def test_the_model_error_of_one_mode_in_place_of_two_is_in_its_total_covariance(
+    apart_hz, noise, numerator_order
+):
+    """Its median was two to ten deviations, where the richer model put its second mode on noise."""
+    found, truth = responses(2, numerator_order, apart_hz, noise)
+    wrong = found.has_status(PolesStatus.MODEL_ERROR)
+    assert wrong.sum() > 10
+    std = np.sqrt(found.total_covariance[wrong, 0, 0, 0])
+    error_hz = np.abs(found.f0_hz[wrong] - truth[:, 0]).min(axis=-1)
+    assert np.mean(error_hz < 4 * std) > 0.9  # in others noise beside takes what is lacking
+    assert np.median(std) < 5  # half the width of either
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.01])
+def test_the_model_error_of_a_record_is_as_large_whatever_its_noise(noise):
+    """It differed thirtyfold from record to record: a search that was ended early was the comparison."""
+    plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), ModelStructure(2, 2))
+    u, y = plan.transform(*record([249.5, 250.5], 0.02))
+    stds = []
+    for seed in range(20):
+        error = np.random.default_rng(seed).standard_normal((u.size, 2)).view(complex)[:, 0]
+        found = plan.from_bins(u, y + noise / np.sqrt(2 * SAMPLES * PERIODS) * error)
+        if found.status() is PolesStatus.MODEL_ERROR:
+            stds.append(np.sqrt(found.total_covariance[0, 0, 0]))
+    assert len(stds) > 10
+    assert min(stds) > 0.5 / 2  # either mode is half a hertz off
+    assert max(stds) < 8 * min(stds)
+
+
+def test_joint_fits_of_two_modes_end_in_the_deeper_minimum():
+    """From one start 18 in a hundred ended with a mode on noise, at a cost ten higher."""
+    structure = ModelStructure(4, 9)
+    plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), structure)
+    u, y = plan.transform(*record([247.5, 252.5], 0.02))
+    error = np.random.default_rng(1).standard_normal((100, u.size, 2)).view(complex)[..., 0]
+    y = y + 0.1 / np.sqrt(2 * SAMPLES * PERIODS) * error
+    found = plan.from_bins(u, y)
+    ok = found.has_status(PolesStatus.OK)
+    assert ok.mean() > 0.97
+    assert (found.significant.all(axis=-1) & ok).mean() > 0.95

@@ -53,6 +53,18 @@ def test_a_transient_that_the_polynomials_do_not_follow_is_told(periods, damping
         assert "beside the mode" not in settled.message
 
 
+@pytest.mark.parametrize("periods", [2, 4, 8])
+@pytest.mark.parametrize("half_width_bins", [0.05, 0.15, 0.45])
+@pytest.mark.parametrize("snr_db", [40, 60])
+def test_total_ellipses_hold_modes_narrower_than_a_bin(periods, half_width_bins, snr_db):
+    """From rest; damping ratios were off by three to sixteen deviations."""
+    damping_ratio = half_width_bins * RATE_HZ / SAMPLES / periods / 250
+    for seed in range(5):
+        mode = poles_of(seed, periods, damping_ratio, snr_db, settled=False).main
+        assert (np.abs(mode.estimate - [250, damping_ratio]) < 3 * mode.std).all()
+        assert mode.f0_hz == pytest.approx(250, abs=0.2 * RATE_HZ / SAMPLES / periods)
+
+
 def test_a_transient_that_they_follow_is_none_of_their_faults():
     for seed in range(10):
         assert poles_of(seed, 8, 0.05, 40, settled=False).status is PolesStatus.OK
