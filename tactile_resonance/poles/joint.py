@@ -38,7 +38,7 @@ from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.model_error import COMPARISON, poles_and_covariance, poorer, richer
 from tactile_resonance.poles.result import PolesBatch
-from tactile_resonance.poles.split import best_of_split
+from tactile_resonance.poles.starts import best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
 

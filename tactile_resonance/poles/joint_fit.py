@@ -20,13 +20,12 @@ from tactile_resonance.poles.fit import Solution, minimise, refit_failed
 from tactile_resonance.poles.joint_noise import TINY, with_noise
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import asks, lacking_terms
-from tactile_resonance.poles.levels import Level, Levels
+from tactile_resonance.poles.levels import Level, Levels, Pieces, smooth_variance
 from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.model_error import systematic_of
 from tactile_resonance.poles.noise_level import are_flat
 from tactile_resonance.poles.realisations_spread import Spread
-from tactile_resonance.poles.scatter import Pieces, smooth_variance
-from tactile_resonance.poles.split import SEVERAL_MODES, best_of_split
+from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:

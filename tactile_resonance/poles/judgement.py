@@ -64,7 +64,7 @@ class Judged:
     lacking : (batch, 3) float
         See `PolesBatch`.
     dispensable : (batch, places) bool
-        Modes without which the fit is as good; see `exchange`.
+        Modes without which the fit is as good; see `starts`.
     remark : (batch,) object
         A further note for people; empty: none.
     """

@@ -17,7 +17,6 @@ from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.covariance import modes_in_band
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.exchange import dispensable, exchanged, moved_to
 from tactile_resonance.poles.fit import (
     RULES,
     DenseSolution,
@@ -28,7 +27,13 @@ from tactile_resonance.poles.fit import (
 )
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.model_error import COMPARISON, poles_and_covariance, poorer, richer
-from tactile_resonance.poles.split import SEVERAL_MODES, best_of_split
+from tactile_resonance.poles.starts import (
+    SEVERAL_MODES,
+    best_of_split,
+    dispensable,
+    exchanged,
+    moved_to,
+)
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
 
@@ -63,7 +68,7 @@ class LinesFit:
     jacobian : (batch, F, 2, n) float or None
         Of real and imaginary parts of the weighted residuals, where each point was fitted alone.
     dispensable : (batch, places) bool or None
-        Modes in the band without which the fit is as good, where any was looked for; see `exchange`.
+        Modes in the band without which the fit is as good, where any was looked for; see `starts`.
     """
 
     theta: FloatArray
