@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -210,13 +210,24 @@ def take_priority(priority: int) -> None:
         ) from error
 
 
-def set_timer_slack(slack_ns: int) -> None:
-    """Let timers of this thread, and of those that it starts, be late by so much [ns] while it has no priority.
+@contextlib.contextmanager
+def loose_timers(slack_ns: int) -> Iterator[None]:
+    """Start threads whose timers may be late by so much [ns] while they have no real-time priority.
 
-    0: by as much as when it began. Linux only, elsewhere nothing is changed.
+    This one has none meanwhile, and those that it starts begin without: with priority there is no slack to hand
+    on. Linux only, elsewhere nothing is changed.
     """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns))
+    if sys.platform != "linux":
+        yield
+        return
+    before, prctl = (os.sched_getscheduler(0), os.sched_getparam(0)), ctypes.CDLL(None).prctl
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns))
+    try:
+        yield
+    finally:
+        prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(0))  # as when it began
+        os.sched_setscheduler(0, *before)
 
 
 def thread_ids() -> set[int]:

@@ -14,7 +14,9 @@ from tactile_resonance.processes import (
     NodeProcesses,
     free_domain_id,
     hold_domain,
-    set_timer_slack,
+    loose_timers,
+    may_take_priority,
+    take_priority,
     thread_ids,
 )
 
@@ -61,17 +63,31 @@ def test_every_node_that_has_ended_is_named_with_its_last_line(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the slack of timers is known on Linux")
-def test_a_thread_keeps_the_slack_of_timers_with_which_it_was_started():
+@pytest.mark.parametrize("priority", [0, 1])
+def test_a_thread_keeps_the_slack_of_timers_with_which_it_was_started(priority):
+    """Also where the one that starts it has real-time priority, and where it has that itself for a while."""
+    if priority and not may_take_priority(priority):
+        pytest.skip("real-time priority is not permitted")
+    found, ends = [], threading.Event()
+
     def slack_ns():
         return ctypes.CDLL(None).prctl(30)  # PR_GET_TIMERSLACK, linux/prctl.h
 
-    before_ns, threads, found, ends = slack_ns(), thread_ids(), [], threading.Event()
-    set_timer_slack(3_000_000)
-    thread = threading.Thread(target=lambda: ends.wait() and found.append(slack_ns()))
-    thread.start()
-    set_timer_slack(0)
-    assert thread_ids() - threads == {thread.native_id}
-    ends.set()
-    thread.join()
-    assert found == [3_000_000]
-    assert slack_ns() == before_ns
+    def start():
+        if priority:
+            take_priority(priority)
+        before, threads = (slack_ns(), os.sched_getscheduler(0)), thread_ids()
+        with loose_timers(3_000_000):
+            thread = threading.Thread(target=lambda: ends.wait() and found.append(slack_ns()))
+            thread.start()
+        found.append((slack_ns(), os.sched_getscheduler(0)) == before)
+        found.append(thread_ids() - threads == {thread.native_id})
+        os.sched_setscheduler(thread.native_id, os.sched_getscheduler(0), os.sched_getparam(0))
+        os.sched_setscheduler(thread.native_id, os.SCHED_OTHER, os.sched_param(0))
+        ends.set()
+        thread.join()
+
+    starter = threading.Thread(target=start)  # its priority ends with it
+    starter.start()
+    starter.join()
+    assert found == [True, True, 3_000_000]

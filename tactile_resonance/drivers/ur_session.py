@@ -19,7 +19,7 @@ from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_motion import UrMotion
-from tactile_resonance.processes import set_timer_slack, take_priority, thread_ids
+from tactile_resonance.processes import loose_timers, take_priority, thread_ids
 
 # The library watches the robot in a thread that wakes for every state; commands need no more than this, and at
 # 500 Hz it takes a sixth of a processor core. After each state it looks twenty times more, 0.1 ms apart: the
@@ -67,15 +67,13 @@ class Session:
                 raise ArmError(ArmFault.COMMAND_REFUSED, f"realtime_{error}") from error
         self._check_remote()
         threads = thread_ids()
-        set_timer_slack(SLACK_NS)
-        with _bounded():
+        with _bounded(), loose_timers(SLACK_NS):
             try:
                 self.control = rtde_control.RTDEControlInterface(
                     config.host, CONTROL_HZ, rt_priority=-1
                 )
             except Exception as error:
                 raise _named(config.host, error) from error
-        set_timer_slack(0)
         self._threads = thread_ids() - threads
         with self._library_hurries():
             self._prepare()

@@ -4,16 +4,18 @@
 In simulated time these cannot be met: what is silent, or hangs, stops the time.
 """
 
+import contextlib
 import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from arms import DOWN, PATIENCE_S
 
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
-from tactile_resonance.processes import may_take_priority
+from tactile_resonance.processes import may_take_priority, take_priority
 
 ACCELERATION_M_S2 = 0.5
 
@@ -135,8 +137,17 @@ def test_of_a_client_with_priority_the_thread_of_the_library_alone_has_none(movi
     robot, arm = moving
     arm.close()
     arm = start_arm(robot.host, simulated=False, realtime_priority=20, max_state_age_s=1.0)
-    arm.connect()
+    try:
+        take_priority(20)  # as a node that starts a client has it
+        arm.connect()
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     first, *others = sorted(map(int, os.listdir(f"/proc/{arm.client_pid}/task")))
     assert first == arm.client_pid
     assert os.sched_getscheduler(first) == os.SCHED_FIFO
     assert [os.sched_getscheduler(thread) for thread in others] == [os.SCHED_OTHER]
+    from tactile_resonance.drivers.ur_session import SLACK_NS  # ur_rtde is here
+
+    with contextlib.suppress(PermissionError):
+        (slack_ns,) = [int(Path(f"/proc/{one}/timerslack_ns").read_text()) for one in others]
+        assert slack_ns == SLACK_NS
