@@ -169,7 +169,7 @@ def assemble(
     if costs_with_less is not None:
         certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
         significant |= _needed(judged, structure, poles, significant, certain, costs_with_less)
-    remark = judged.remark
+    remark = _without_lost_totals(quantities["total_covariance"], significant, judged.remark)
     if poles.shape[-1] > 1:
         remark = _widen(quantities, second_order(poles, significant, distance), remark)
     code = np.full(hopeless.shape, STATUS_CODE[PolesStatus.OK], np.uint8)
@@ -248,6 +248,22 @@ def _needed(
         fall = costs_with_less(rows) - judged.cost[rows]
         beside[rows] &= (fall > level * fall_of_noise(lines))[:, None]
     return beside
+
+
+def _without_lost_totals(
+    total: FloatArray, significant: BoolArray, remark: npt.NDArray[np.object_]
+) -> npt.NDArray[np.object_]:
+    """Total covariances (batch, k, 2, 2) that rounding has made negative become NaN; the remark says so."""
+    lost = (np.diagonal(total, axis1=-2, axis2=-1) <= 0).any(axis=-1)
+    if not lost.any():
+        return remark
+    total[lost] = np.nan
+    rows = np.flatnonzero((lost & significant).any(axis=-1))
+    remark = remark.copy()
+    for k in rows:
+        note = "the total covariance is lost to rounding: a smaller order has one"
+        remark[k] = "; ".join(filter(None, [remark[k], note]))
+    return remark
 
 
 def _widen(

@@ -83,6 +83,26 @@ def test_the_one_mode_is_reported_with_an_honest_ellipse(fits, order):
     assert stats.binom.cdf(inside, len(good), 0.94) > 0.0005
 
 
+def test_a_total_covariance_that_rounding_took_is_none():
+    """At 100 dB six in ten had negative variances; those of the noise are right."""
+    args = (RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), ModelStructure(4, 4))
+    plan, rng = PoleEstimator(*args), np.random.default_rng(2)
+    u, y = plan.transform(*record(noise=0.0))
+    variance = 1e-10 / (SAMPLES * PERIODS)
+    shape = (RUNS, 2, u.size)
+    u, y = u + circular(rng, shape, variance / 100), y + circular(rng, shape, variance)
+    result = plan.from_bins(u, y)
+    total = result.total_covariance
+    assert not (np.diagonal(total, axis1=-2, axis2=-1) <= 0).any()
+    known = result.has_status(PolesStatus.OK)
+    assert known.mean() > 0.9
+    for k in np.flatnonzero(known):
+        lost = np.isnan(total[k][result.significant[k], 0, 0])
+        assert lost.any() == ("lost to rounding" in result.remark[k])
+        errors = result.f0_hz[k][result.significant[k]] - 250
+        assert (np.abs(errors) < 5 * np.sqrt(result.covariance[k][result.significant[k], 0, 0])).all()
+
+
 def test_a_model_error_shows_once_an_unstable_mode_is_left_out():
     """Lines three times as noisy as stated: no mode explains that, and none that fits it is real."""
     points = points_of(from_frfs(4, stated=1e-6 / 9))
