@@ -53,6 +53,8 @@ APART = 0.7
 CHANCE = 0.3
 # Starts that are tried before a minimum is taken for the deepest, those of the least cost first.
 STARTS = 3
+# Poles at which a mode is tried in one pass: of thousands of lines more take gigabytes.
+TRIED_AT_ONCE = 128
 # Poles nearer than this part of a half width are of the same mode.
 SAME = 0.5
 
@@ -300,21 +302,46 @@ def _most_lacking(
     jacobian = solution.jacobian[0][used].reshape(-1, solution.theta.size)
     basis = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0]
     residual = np.ascontiguousarray(solution.residual[0][used]).view(float)
-    s = 2j * np.pi * plan.frequency_hz[used][:, None]
-    above, below = 1 / (s - tried), 1 / (s - tried.conj())
-    weight = np.abs(tried.real) / np.sqrt(variance[used])[:, None] * row.u[0, 0][used][:, None]
-    pair = np.stack([(above + below) * weight, 1j * (above - below) * weight])  # (2, K, N)
-    pair = np.stack([pair.real, pair.imag], axis=2).reshape(2, -1, tried.size)
-    whole = np.sum(pair[0] ** 2, axis=0) * np.sum(pair[1] ** 2, axis=0)
-    pair = pair - basis @ (basis.T @ pair)
-    score = residual @ pair  # (2, N)
-    p_00, p_11, p_01 = (np.sum(pair[i] * pair[j], axis=0) for i, j in ((0, 0), (1, 1), (0, 1)))
-    determinant = p_00 * p_11 - p_01**2
-    fall = (p_11 * score[0] ** 2 - 2 * p_01 * score[0] * score[1] + p_00 * score[1] ** 2) / determinant
-    fall[~(determinant > LEAST_LEFT * whole)] = 0.0
+    s = np.asarray(2j * np.pi * plan.frequency_hz[used][:, None])
+    weight = (row.u[0, 0][used] / np.sqrt(variance[used]))[:, None]
+    # not all at once: those tried are about as many as lines
+    parts = np.array_split(tried, -(-tried.size // TRIED_AT_ONCE))
+    fall = np.concatenate([_falls(s, weight, basis, residual, part) for part in parts])
     k = int(np.argmax(fall))
     dof = used.sum() - solution.theta.size / 2
     return complex(tried[k]), float((dof - 1) * np.log1p(-fall[k] / solution.cost) + np.log(tried.size))
+
+
+def _falls(
+    s: ComplexArray,
+    weight: ComplexArray,
+    basis: FloatArray,
+    residual: FloatArray,
+    tried: ComplexArray,
+) -> FloatArray:
+    """(N,) by how much a mode at each of N poles lets the cost fall, in the first step.
+
+    Parameters
+    ----------
+    s : (K, 1) complex
+    weight : (K, 1) complex
+        By which a response becomes a residual.
+    basis : (2 K, parameters) float
+        Orthonormal, of the directions that the model has already.
+    residual : (2 K,) float
+    tried : (N,) complex
+    """
+    above, below = 1 / (s - tried), 1 / (s - tried.conj())
+    scaled = np.abs(tried.real) * weight
+    pair = np.stack([(above + below) * scaled, 1j * (above - below) * scaled])  # (2, K, N)
+    step = np.stack([pair.real, pair.imag], axis=2).reshape(2, -1, tried.size)
+    whole = np.sum(step[0] ** 2, axis=0) * np.sum(step[1] ** 2, axis=0)
+    step = step - basis @ (basis.T @ step)
+    score = residual @ step  # (2, N)
+    p_00, p_11, p_01 = (np.sum(step[i] * step[j], axis=0) for i, j in ((0, 0), (1, 1), (0, 1)))
+    determinant = p_00 * p_11 - p_01**2
+    fall = (p_11 * score[0] ** 2 - 2 * p_01 * score[0] * score[1] + p_00 * score[1] ** 2) / determinant
+    return np.where(determinant > LEAST_LEFT * whole, fall, 0.0)
 
 
 def _variance(plan: LinesPlan, row: BinData) -> FloatArray:
