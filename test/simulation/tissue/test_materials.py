@@ -255,7 +255,7 @@ def test_gradient_scene_is_read(tmp_path, library):
             {"regions__0__heterogeneity": {"modulus_spread": 2.0, "correlation_length_m": 1.0}},
             r"heterogeneity\.modulus_spread.*0 to 1",
         ),
-        ({"buried__0__gelatine_percent": 99.0}, r"buried\[0\]\.percent"),
+        ({"buried__0__gelatine_percent": 99.0}, r"buried\[0\]\.gelatine_percent"),
         ({"buried__0__disc": {}}, r"buried\[0\]\.disc"),
     ],
 )
