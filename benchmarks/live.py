@@ -2,7 +2,7 @@
 """What a scan takes of the processors on the wall clock, process by process.
 
 The nodes of `tactile_resonance scan --real-time` with a simulated robot and load cell: nothing under way,
-from 5 s after they came up; a contact of 1 cN held; a scan; two scans at once, each with nodes and a robot
+from 12 s after they came up; a contact of 1 cN held; a scan; two scans at once, each with nodes and a robot
 of its own.
 Shares are the processor time of all threads of a process over time: of one core. Other work of the
 machine makes them larger, by what it takes of caches and clock, and the loop slower by as much. A virtual

@@ -38,7 +38,7 @@ CONTACT_WITHIN_S = 30.0
 SCAN_WITHIN_S = 600.0
 HOLD_TRIES = 5
 RETRACT_TRIES, RETRACT_S = 20, 1.0
-SETTLED_S = 5.0
+SETTLED_S = 12.0
 LOOK_EVERY_S = 0.5
 CHILDREN = {"contact_node": "ur_client", "fake_hardware_node": "simulate-ur"}
 """The process that a node starts."""
