@@ -58,8 +58,8 @@ SAME_RAD = 1e-4
 """Goals turned by less against each other are turned alike: the weight of a dish turns with the tip."""
 
 IDLE_PERIODS = 10
-"""While no contact is under way one of so many periods is run, unless it is stated: 20 ms, half of what the
-watchdog of a robot, of 25 Hz, allows, since in simulated time it is fed once per period."""
+"""While no contact is under way one of so many periods is run, where nothing else is stated: 20 ms, half of
+what a robot's watchdog of 25 Hz allows, since in simulated time it is fed once per period."""
 
 CALM = 2.5
 """Deviations by which the force of a held contact that is calm is off at most, as a mean of some forces."""

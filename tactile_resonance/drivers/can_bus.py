@@ -11,7 +11,6 @@ import time
 from binascii import Error as HexError
 from binascii import unhexlify
 from collections import deque
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import can
@@ -50,10 +49,6 @@ class Frame(NamedTuple):
     data: bytes
     stamp_s: float
     arrival_ns: int
-
-
-# what `Frame` itself calls, at half of the time
-_new_frame = partial(tuple.__new__, Frame)
 
 
 class Bus(Protocol):
@@ -141,13 +136,11 @@ class SocketcandBus:
         found, arrival_ns = _FRAME.findall(received, 0, end), time.monotonic_ns()
         try:
             frames = [
-                _new_frame(
-                    (
-                        int(number, 16) | (EXTENDED if len(number) > 3 else 0),
-                        unhexlify(text.replace(b" ", b"")),
-                        float(stamp),
-                        arrival_ns,
-                    )
+                Frame(
+                    int(number, 16) | (EXTENDED if len(number) > 3 else 0),
+                    unhexlify(text.replace(b" ", b"")),
+                    float(stamp),
+                    arrival_ns,
                 )
                 if kind == b"frame"
                 else Frame(int(number, 16) | EXTENDED | ERROR, b"", float(stamp), arrival_ns)

@@ -65,7 +65,7 @@ def best_of_split(
     model: RationalModel,
     solution: Solution,
 ) -> Solution:
-    """The solution, or that from a start with its highest peak split where it costs less than noise explains.
+    """The solution, or that from a start with its highest peak split if that costs less by more than noise.
 
     Parameters
     ----------

@@ -133,7 +133,7 @@ class Posture:
         self._tools: list[tuple[Transform, Transform]] = [(IDENTITY, self.flange)]
 
     def tool(self, tcp: Transform) -> Transform:
-        """Return a frame that the flange carries, in the base; each is computed once."""
+        """Return a frame that the flange carries, in the base; each, known by identity, is computed once."""
         for known, tool in self._tools:
             if known is tcp:
                 return tool
