@@ -67,35 +67,33 @@ class Session:
                 raise ArmError(ArmFault.COMMAND_REFUSED, f"realtime_{error}") from error
         self._check_remote()
         threads = thread_ids()
-        with _bounded(), loose_timers(SLACK_NS):
-            try:
-                self.control = rtde_control.RTDEControlInterface(
-                    config.host, CONTROL_HZ, rt_priority=-1
-                )
-            except Exception as error:
-                raise _named(config.host, error) from error
+        with _bounded(), loose_timers(SLACK_NS), _faults_of(config.host):
+            self.control = rtde_control.RTDEControlInterface(
+                config.host, CONTROL_HZ, rt_priority=-1
+            )
         self._threads = thread_ids() - threads
-        with self._library_hurries():
+        with self._library_hurries(), _faults_of(config.host):
             self._prepare()
 
     def restart(self) -> None:
         """Upload the program again, after a stop has been released. Raises `ArmError`."""
         self._check_remote()
-        # the velocity of the moment when the program ended still stands in the command register, and a
-        # new program would follow it; what the library does not send to a stopped program clears it
-        self.control.kickWatchdog()
-        time.sleep(CLEARING_S)
-        if not self.control.reuploadScript():
-            raise ArmError(ArmFault.PROGRAM_NOT_STARTED, "the program could not be sent")
-        deadline = time.monotonic() + 2.0
-        while not self.control.isProgramRunning():
-            if time.monotonic() > deadline:
-                raise ArmError(
-                    ArmFault.PROGRAM_NOT_STARTED, "the program was sent again and does not run"
-                )
-            time.sleep(0.01)
-        with self._library_hurries():
-            self._prepare()
+        with _faults_of(self.config.host):
+            # the velocity of the moment when the program ended still stands in the command register, and a
+            # new program would follow it; what the library does not send to a stopped program clears it
+            self.control.kickWatchdog()
+            time.sleep(CLEARING_S)
+            if not self.control.reuploadScript():
+                raise ArmError(ArmFault.PROGRAM_NOT_STARTED, "the program could not be sent")
+            deadline = time.monotonic() + 2.0
+            while not self.control.isProgramRunning():
+                if time.monotonic() > deadline:
+                    raise ArmError(
+                        ArmFault.PROGRAM_NOT_STARTED, "the program was sent again and does not run"
+                    )
+                time.sleep(0.01)
+            with self._library_hurries():
+                self._prepare()
 
     @property
     def listening(self) -> bool:
@@ -185,14 +183,20 @@ def _bounded() -> Iterator[None]:
         signal.alarm(0)
 
 
-def _named(host: str, error: Exception) -> ArmError:
-    """Give the library's exception a fault; it has texts only."""
-    text = " ".join(str(error).split())
-    for part, fault in (
-        ("remote control", ArmFault.NOT_REMOTE),
-        ("already in use", ArmFault.REGISTERS_IN_USE),
-        ("start control script", ArmFault.PROGRAM_NOT_STARTED),
-    ):
-        if part in text:
-            return ArmError(fault, f"{host}: {text}")
-    return ArmError(ArmFault.LINK_LOST, f"{host}: {text}")
+@contextlib.contextmanager
+def _faults_of(host: str) -> Iterator[None]:
+    """Give the library's exceptions a fault; they have texts only."""
+    try:
+        yield
+    except ArmError:
+        raise
+    except Exception as error:
+        text = " ".join(str(error).split())
+        for part, fault in (
+            ("remote control", ArmFault.NOT_REMOTE),
+            ("already in use", ArmFault.REGISTERS_IN_USE),
+            ("start control script", ArmFault.PROGRAM_NOT_STARTED),
+        ):
+            if part in text:
+                raise ArmError(fault, f"{host}: {text}") from error
+        raise ArmError(ArmFault.LINK_LOST, f"{host}: {text}") from error

@@ -139,7 +139,7 @@ def test_of_a_client_with_priority_the_thread_of_the_library_alone_has_none(movi
     arm = start_arm(robot.host, simulated=False, realtime_priority=20, max_state_age_s=1.0)
     try:
         take_priority(20)  # as a node that starts a client has it
-        arm.connect()
+        connect_again(robot, arm)
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     first, *others = sorted(map(int, os.listdir(f"/proc/{arm.client_pid}/task")))

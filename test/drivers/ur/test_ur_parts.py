@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.interfaces import ArmFault
+from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.rtde_stream import RobotState
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.drivers.ur_exchange import (
@@ -289,3 +289,25 @@ def test_wrong_configurations_are_named(tmp_path, text, message):
 def test_bits_and_modes_have_names(bits, mode, runtime, fault):
     found = motion_fault(bits, mode, runtime)
     assert (None if found is None else found[0]) is fault
+
+
+@pytest.mark.parametrize("silent", ["kickWatchdog", "reuploadScript", "getTCPOffset", "setWatchdog"])
+def test_what_the_library_raises_for_want_of_an_answer_is_a_lost_link(silent):
+    """ur_rtde raises RuntimeError where a robot, or the machine, is too slow for its limit of 0.5 s."""
+    pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
+    from tactile_resonance.drivers.ur_session import Session
+
+    config = UrArmConfig(host="127.0.0.1", check_dashboard=False)
+
+    def unanswered(*_):
+        raise RuntimeError(f"{silent}() function did not succeed!")
+
+    session = Session(config, None)
+    session._threads = set()
+    answers = dict.fromkeys(("kickWatchdog", "reuploadScript", "isProgramRunning", "setTcp"), lambda *_: True)
+    answers["getTCPOffset"] = lambda: config.tip_in_flange.vector.tolist()
+    answers |= {"setPayload": lambda *_: True, silent: unanswered}
+    session.control = SimpleNamespace(**answers)
+    with pytest.raises(ArmError, match=rf"127.0.0.1: {silent}\(\) function did not succeed!") as error:
+        session.restart()
+    assert error.value.fault is ArmFault.LINK_LOST
