@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,8 @@ from tactile_resonance.tones import MAINS_HZ, ROUNDING
 
 SHARE_AT_TOP = 1 / np.sqrt(2)
 """Largest share of a quantised peak's two topmost values that is at the top: a parabola's, cut at both."""
+FEWEST_ON_TOP = 4
+"""Samples at the largest value; fewer stand there by chance, whether quantised or not."""
 GRID_SAMPLES, FEW_ALIKE = 2000, 0.98
 """Equal samples of a converter from which on its counts are taken to repeat."""
 LARGE_OFFSET = 0.1
@@ -215,6 +218,11 @@ class _Channel:
         """False where a sample is missing, which makes all bins NaN."""
         return bool(np.isfinite(self.bins[0]))
 
+    @cached_property
+    def rms(self) -> float:
+        """About the mean [V]."""
+        return float(np.std(self.samples))
+
     def fault(self, kind: FaultKind, value: float, spoils: bool, text: str) -> Fault:
         return Fault(kind, self.name, float(value), spoils, text)
 
@@ -227,9 +235,10 @@ def missing_samples(x: _Channel) -> Fault | None:
         return x.fault(FaultKind.MISSING_SAMPLES, bad, True, text)
     record = x.samples.ravel()
     cycle = max(8, -(-x.samples.shape[1] // int(np.max(x.harmonics))))
-    some = record[:: cycle // 2]
-    if not np.any(some[1:] == some[:-1]):
-        return None  # of what is held for longer than a cycle, two of these are neighbours
+    some = record[:: cycle // 4]
+    same = some[1:] == some[:-1]
+    if not np.any(same[2:] & same[1:-1] & same[:-2]):
+        return None  # of what is held for longer than a cycle, four of these are neighbours
     starts, lengths = _runs(record)
     value = record[starts]
     # a clipped peak is held too, but that is saturation
@@ -262,20 +271,20 @@ def saturation(x: _Channel) -> Fault | None:
 
 def offset(x: _Channel) -> Fault | None:
     """A mean that is large against the signal. It harms no line, but takes up range."""
-    rms = float(np.std(x.samples))
     mean = float(np.mean(x.samples))
-    if abs(mean) <= LARGE_OFFSET * rms:
+    if abs(mean) <= LARGE_OFFSET * x.rms:
         return None
-    text = f"The {x.name} has an offset of {mean:.3g} V beside {rms:.3g} V rms"
+    text = f"The {x.name} has an offset of {mean:.3g} V beside {x.rms:.3g} V rms"
     return x.fault(FaultKind.OFFSET, abs(mean), False, text)
 
 
 def drift(x: _Channel) -> Fault | None:
     """Period means that wander. In a single period drift is not distinguished from its slowest lines."""
+    if x.periods < 2:
+        return None
     means = x.samples.mean(axis=-1)
-    rms = float(np.std(x.samples - means[:, None]))
     spread = float(np.ptp(means))
-    if x.periods < 2 or spread <= LARGE_DRIFT * rms:
+    if spread <= LARGE_DRIFT * float(np.std(x.samples - means[:, None])):
         return None
     text = f"The mean of the {x.name} drifts by {spread:.3g} V over the record"
     return x.fault(FaultKind.DRIFT, spread, x.transient_spoils, text)
@@ -288,38 +297,17 @@ def hum(x: _Channel) -> Fault | None:
     draws on. Hum that falls exactly on a harmonic of several periods cannot be seen: it looks like
     excitation or distortion.
     """
-    periods, samples = x.samples.shape
-    resolution = x.sample_rate_hz / (periods * samples)
-    highest = MAINS_HARMONICS * max(MAINS_HZ) / resolution + _HUM_FLOOR_BINS[1]
-    power = 2 * np.abs(x.bins[: math.ceil(highest) + 1]) ** 2  # mean square per bin
-    rounding = ROUNDING * float(np.var(x.samples))
-    excited = np.zeros(power.size, bool)
-    lines = x.harmonics * periods
-    excited[lines[lines < power.size]] = True
-    usable = ~excited
-    if periods > 1:
-        usable[::periods] = False  # harmonics not excited may hold distortion
+    lines = np.asarray(x.harmonics, np.int64).tobytes()
+    count, places = _hum_places(x.sample_rate_hz, *x.samples.shape, lines)
+    power = 2 * np.abs(x.bins[:count]) ** 2  # mean square per bin
+    rounding = ROUNDING * x.rms**2
     found: list[tuple[float, float, bool]] = []
     for mains in MAINS_HZ:
         peaks = []
-        for k in range(1, MAINS_HARMONICS + 1):
-            centre = round(k * mains / resolution)
-            # the floor is taken where leakage of the hum has died out
-            away = np.arange(*_HUM_FLOOR_BINS)
-            around = centre + np.concatenate([-away, away])
-            around = around[(around > 0) & (around < power.size)]
-            around = around[usable[around]]
-            peak = centre + np.arange(-1, 2)
-            peak = peak[(peak > 0) & (peak < power.size)]
-            peak = peak[usable[peak]]
-            if around.size < 8 or peak.size == 0:
-                continue
+        for hz, around, peak, limit, near in places[mains]:
             floor = np.median(power[around]) / np.log(2)  # mean of an exponential distribution
-            # the floor of a few bins is itself uncertain
-            limit = special.fdtri(2, 2 * around.size, 1 - _FALSE_ALARM / peak.size)
             if power[peak].max() > max(2 * limit * floor, rounding):
-                near = bool(np.any(excited[max(0, centre - 5) : centre + 6]))
-                peaks.append((k * mains, float(power[peak].sum()), near))
+                peaks.append((hz, float(power[peak].sum()), near))
         # the fundamental may be hidden, a single high harmonic may be anything
         if peaks and (peaks[0][0] == mains or len(peaks) > 1):
             found += peaks
@@ -329,6 +317,43 @@ def hum(x: _Channel) -> Fault | None:
     names = ", ".join(f"{line[0]:g}" for line in found)
     text = f"Mains hum in the {x.name} at {names} Hz, at least {rms:.2g} V rms"
     return x.fault(FaultKind.HUM, rms, any(line[2] for line in found), text)
+
+
+@lru_cache(maxsize=16)
+def _hum_places(
+    sample_rate_hz: float, periods: int, samples: int, harmonics: bytes
+) -> tuple[int, dict[float, list[tuple[float, IntArray, IntArray, float, bool]]]]:
+    """How many bins hum needs, and where it shows, by mains frequency.
+
+    Each a frequency [Hz], bins around it and on it, the limit of the largest of these over the mean of those,
+    and whether an excited line is near; `harmonics` are bytes of int64.
+    """
+    resolution = sample_rate_hz / (periods * samples)
+    highest = MAINS_HARMONICS * max(MAINS_HZ) / resolution + _HUM_FLOOR_BINS[1]
+    count = min(math.ceil(highest), periods * samples // 2) + 1
+    excited = np.zeros(count, bool)
+    lines = np.frombuffer(harmonics, np.int64) * periods
+    excited[lines[lines < count]] = True
+    usable = ~excited
+    if periods > 1:
+        usable[::periods] = False  # harmonics not excited may hold distortion
+    # the floor is taken where leakage of the hum has died out
+    away = np.arange(*_HUM_FLOOR_BINS)
+    places: dict[float, list] = {mains: [] for mains in MAINS_HZ}
+    for mains in MAINS_HZ:
+        for k in range(1, MAINS_HARMONICS + 1):
+            centre = round(k * mains / resolution)
+            around, peak = (
+                at[(at > 0) & (at < count)]
+                for at in (centre + np.concatenate([-away, away]), centre + np.arange(-1, 2))
+            )
+            around, peak = around[usable[around]], peak[usable[peak]]
+            if around.size >= 8 and peak.size:
+                # the floor of a few bins is itself uncertain
+                limit = float(special.fdtri(2, 2 * around.size, 1 - _FALSE_ALARM / peak.size))
+                near = bool(np.any(excited[max(0, centre - 5) : centre + 6]))
+                places[mains].append((k * mains, around, peak, limit, near))
+    return count, places
 
 
 def lost_samples(x: _Channel) -> Fault | None:
@@ -416,18 +441,18 @@ def _clipped(record: FloatArray, periods: int) -> int:
     as many stand at the largest value as at the next. A few more may by chance (binomial test).
     """
     largest = record.max()
-    rest = record[record < largest]
-    if rest.size == 0:
+    top = int(np.count_nonzero(record == largest))
+    if top < FEWEST_ON_TOP or top == record.size:
         return 0
-    top = record.size - rest.size
-    following = np.count_nonzero(rest == rest.max())
+    second = np.max(record, where=record < largest, initial=-np.inf)
+    following = np.count_nonzero(record == second)
     some = record[:GRID_SAMPLES]
     some = some[(some < largest) & (some > record.min())]
     if np.unique(some).size > FEW_ALIKE * some.size:
         # not quantised: equal values are no chance, unless a period without noise is repeated
         spans = record.reshape(periods, -1)
         repeated = periods if np.array_equal(spans[1:], spans[:-1]) else 1
-        return top if top >= 4 * repeated else 0
+        return top if top >= FEWEST_ON_TOP * repeated else 0
     # probability of so many or more out of both; periods repeat each other, one counts
     one, next_one = top // periods, -(-following // periods)
     chance = special.bdtrc(one - 1, one + next_one, SHARE_AT_TOP) if one else 1.0
