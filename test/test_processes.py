@@ -3,7 +3,9 @@
 
 import ctypes
 import os
+import platform
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -91,3 +93,27 @@ def test_a_thread_keeps_the_slack_of_timers_with_which_it_was_started(priority):
     starter.start()
     starter.join()
     assert found == [True, True, 3_000_000]
+
+
+MADE_AGAIN = """
+import resource
+import numpy as np
+from tactile_resonance.processes import keep_memory
+
+{0}
+for _ in range(3):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    arrays = [np.ones(2**17) for _ in range(16)]  # 16 MiB
+    made = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+    del arrays
+print(made)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the allocator is that of glibc")
+def test_memory_that_is_kept_is_not_mapped_anew():
+    def pages(first):
+        command = [sys.executable, "-c", MADE_AGAIN.format(first)]
+        return int(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
+
+    assert pages("keep_memory()") < 100 < 1000 < pages("")

@@ -25,7 +25,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import uninstall_signal_handlers
 
 from tactile_resonance.drivers.acquisition import DeviceError
-from tactile_resonance.processes import ENDING
+from tactile_resonance.processes import ENDING, keep_memory
 
 RCLError = rclpy_implementation.RCLError
 
@@ -90,6 +90,7 @@ def run_node(make: Callable[[], Node]) -> None:
     ignored, so that the node ends in order. A node that does not end in time, because something in it hangs, is
     ended all the same.
     """
+    keep_memory()
     interrupted = False
 
     def end_in_time(*_: object) -> None:
