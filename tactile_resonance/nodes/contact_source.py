@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import replace
 from typing import Protocol
@@ -63,15 +64,14 @@ class MeasuredContact:
         if not self._client.service_is_ready():
             return Contact(reason=f"no node serves {self._client.srv_name}")
         request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))
+        answered = threading.Event()
         future = self._client.call_async(request)
-        deadline = time.monotonic() + self._within_s
-        while not future.done():
-            if time.monotonic() > deadline:
-                self._client.remove_pending_request(future)
-                return Contact(
-                    reason=f"no answer on {self._client.srv_name} within {self._within_s:g} s"
-                )
-            time.sleep(POLL_S)
+        future.add_done_callback(lambda _: answered.set())
+        if not answered.wait(self._within_s):
+            self._client.remove_pending_request(future)
+            return Contact(
+                reason=f"no answer on {self._client.srv_name} within {self._within_s:g} s"
+            )
         over: ForceOver.Response = future.result()
         contact = contact_from_message(over.tip_pose, over.force_n, over.force_std_n)
         spread = spread_from_message(over, "force_")

