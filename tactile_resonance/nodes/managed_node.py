@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
 import os
 import threading
@@ -361,30 +360,20 @@ class ManagedNode(LifecycleNode):
 async def in_thread(node: ManagedNode, work: Callable[[], Any], name: str) -> Any:
     """Result of long `work`, done in a thread of that name while the executor goes on.
 
-    A future that is set from another thread may never wake its coroutine; a guard condition wakes the
-    executor, which sets it.
+    A future that is set from another thread may never wake its coroutine: the executor sets it.
     """
-    outcome: concurrent.futures.Future = concurrent.futures.Future()
     finished = Future()
-
-    def wake() -> None:
-        if outcome.done() and not finished.done():
-            finished.set_result(None)
-
-    guard = node.create_guard_condition(wake)
 
     def run() -> None:
         try:
-            outcome.set_result(work())
+            set_it = partial(finished.set_result, work())
         except Exception as error:
-            outcome.set_exception(error)
-        with contextlib.suppress(InvalidHandle):  # the node has gone, and nobody waits
-            guard.trigger()
+            set_it = partial(finished.set_exception, error)
+        with contextlib.suppress(AttributeError, InvalidHandle):  # the node has gone, nobody waits
+            node.executor.create_task(set_it)
 
     threading.Thread(target=run, name=name, daemon=True).start()
-    await finished
-    node.destroy_guard_condition(guard)
-    return outcome.result()
+    return await finished
 
 
 def end_goal(goal: ServerGoalHandle, done: bool) -> None:
