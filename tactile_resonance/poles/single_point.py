@@ -87,6 +87,8 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
 
 
 def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) -> str:
+    if status is PolesStatus.OK:
+        return ""
     low_hz, high_hz = batch.band_hz
     structure = batch.structure
     sentences = {
