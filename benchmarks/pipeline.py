@@ -210,9 +210,10 @@ def _report(results: Mapping[str, Latencies], raised: bool) -> str:
     lines += [
         "",
         "A stage ends where the next begins: what waits for a processor is in the stage that waits. The bench",
-        "hands a block out when its last sample would have been taken and computes the next one meanwhile; a",
-        "device adds its own latency in place of the first row. The second row holds the record's way from the",
-        "bench to `excitation_node` and into its file, before anybody hears of it; the disk has it soon after.",
+        "makes a block when its last sample would have been taken: only then it knows what became of the",
+        "contact; a device has its own latency in place of the first row. The second row holds the record's",
+        "way to `excitation_node`, the question for its force, and its file, before anybody hears of it; the",
+        "disk has it soon after.",
         "Computing is what the nodes tell of themselves in `/diagnostics`, of every second: the median of the",
         "means, 99 % of the longest. It is the time in which a message kept its node, publishing included;",
         "between the nodes it is the middleware and the waking of a process that take their time.",
