@@ -222,18 +222,20 @@ def _linearised(
     directions = np.concatenate([modes.directions(row) for row in rows])
     others = plan.other_bins.size
     data = BinData.of(y[None, None], u[None, None], plan.order, others)
+    if not flat:
+        data, _ = with_noise(plan, data, theta[None, None])
+    at = Linearised.of(plan.problem, data, theta)
     if flat:
-        error = Linearised.of(plan.problem, data, theta).error[:, :others]
+        error = at.error[:, :others]
         variance_y, variance_u = rough_noise(error, data.u[0][:, data.order[:others]])
         data = data.weighted(rest=variance_y, variance_y=variance_y, variance_u=variance_u)
-    else:
-        data, _ = with_noise(plan, data, theta[None, None])
     costs, gradients, normals = moments(plan.problem.tables, data, theta[None, None])
     cost, gradient = float(costs.sum()), gradients[0, 0]
-    at = Linearised.of(plan.problem, data, theta)
-    root = 1 / np.sqrt(at.variance)
+    variance = data.variance[0]
+    variance[others:] = data.residual_variance(plan.problem.response(theta[None]))[0]
+    root = 1 / np.sqrt(variance)
     own = np.ascontiguousarray(-(at.slope[0] * root[:, None]).T).view(float)  # (n, 2 K)
-    residual = np.ascontiguousarray(at.residual[0]).view(float)
+    residual = np.ascontiguousarray(at.error[0] * root).view(float)
     more = np.ascontiguousarray(-directions[:, plan.order] * root).view(float)
     crossed = own @ more.T  # (n, c)
     try:
