@@ -425,9 +425,8 @@ def calibrated_poles(
         return replace(found.poles, further=further)
     elif found is not None:
         reason = found.poles.message
-    poles = poles_of_bands(frf, bands, method)
     note = f"without the calibrated sensor: {reason}"
-    return replace(poles, message="; ".join(filter(None, [poles.message, note])))
+    return poles_of_bands(frf, bands, method).noting(note)
 
 
 def _impossible(frf: FRF) -> str:

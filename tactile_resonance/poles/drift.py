@@ -333,8 +333,8 @@ def poles_with_drift(
 def _changed(poles: Poles, reason: str) -> Poles:
     """Poles of a record that changes as no model here does."""
     total = poles.covariance if poles.total_covariance is None else poles.total_covariance
-    message = "; ".join(filter(None, [poles.message, reason]))
-    return replace(poles, status=PolesStatus.MODEL_ERROR, total_covariance=total, message=message)
+    changed = replace(poles, status=PolesStatus.MODEL_ERROR, total_covariance=total)
+    return changed.noting(reason)
 
 
 def _result(modes: DriftingModes, drift: FloatArray, at: _Step) -> Poles:
@@ -374,11 +374,11 @@ def _result(modes: DriftingModes, drift: FloatArray, at: _Step) -> Poles:
         for f0, rate, std in zip(poles.f0_hz, rates[real], deviations[real], strict=True)
         if np.any(np.abs(rate) > 3 * std)
     ]
-    return replace(
+    drifting = replace(
         poles,
         f0_drift_hz_per_s=rates[real, 0],
         damping_drift_per_s=rates[real, 1],
         drift_covariance=of_rates[real],
         instant_s=instant_s,
-        message="; ".join(filter(None, [poles.message, *told])),
     )
+    return drifting.noting(*told)

@@ -55,8 +55,7 @@ def poles_of_frf(
     if method == "frf" or frf.bins is None or reason:
         poles = identify_frf(frf, band_hz, structure)
         if method == "auto" and frf.bins is not None:
-            message = "; ".join(filter(None, [poles.message, f"from the FRF: {reason}"]))
-            poles = replace(poles, message=message)
+            poles = poles.noting(f"from the FRF: {reason}")
         return poles
     notes = [frf.message] if frf.status is not FrfStatus.OK else []
     poles = identify_poles_from_bins(frf.bins, band_hz, structure, notes=notes)
@@ -109,10 +108,8 @@ def second_attempt(
         return poles
     again = identify_frf(frf, band_hz, structure)
     if again.status not in (PolesStatus.OK, PolesStatus.MODEL_ERROR, PolesStatus.NO_COVARIANCE):
-        also = f"from the FRF: {again.status.value}"
-        return replace(poles, message="; ".join(filter(None, [poles.message, also])))
-    note = "from the FRF: the joint fit did not converge"
-    return replace(again, message="; ".join(filter(None, [again.message, note])))
+        return poles.noting(f"from the FRF: {again.status.value}")
+    return again.noting("from the FRF: the joint fit did not converge")
 
 
 def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelStructure) -> str:

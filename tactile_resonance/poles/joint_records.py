@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from tactile_resonance.poles.noise_level import LEAST_VARIANCE, two_channels
 from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.poles.tones import PlanOf, poles_without_tones
+from tactile_resonance.poles.tones import poles_without_tones
 
 DISTURBED = 1e-2
 """Power of the input between harmonics over that on the excited lines from which all bins are tried: less
@@ -68,21 +68,16 @@ def identify_poles_from_records(
         raise ValueError(f"u: shape {np.shape(u)}, expected (P, N) or (M, P, N)")
     if np.ndim(u) == 3 and len(u) == 1:
         u, y = u[0], y[0]
-
-    @lru_cache(maxsize=2)
-    def plan_of(left_out: tuple[int, ...]) -> JointPlan:
-        return (JointPlan if np.ndim(u) == 2 else PoleEstimator)(
-            sample_rate_hz,
-            np.shape(u)[-1],
-            np.shape(u)[-2],
-            harmonics,
-            band_hz,
-            structure or ModelStructure(),
-            input_noise_ratio=input_noise_ratio,
-            left_out=left_out,
-        )
-
-    return _of_plan(plan_of, *plan_of(()).transform(u, y))
+    plan = (JointPlan if np.ndim(u) == 2 else PoleEstimator)(
+        sample_rate_hz,
+        np.shape(u)[-1],
+        np.shape(u)[-2],
+        harmonics,
+        band_hz,
+        structure or ModelStructure(),
+        input_noise_ratio=input_noise_ratio,
+    )
+    return _of_plan(plan, *plan.transform(u, y))
 
 
 def identify_poles_from_bins(
@@ -111,18 +106,15 @@ def identify_poles_from_bins(
     """
     if band_hz is None:
         band_hz = bins.band_hz
-    plan_of = partial(
-        _plan,
+    plan = _plan(
         bins.sample_rate_hz,
         bins.samples_per_period,
         bins.periods,
         whole_harmonics(bins.harmonics).tobytes(),
         (float(band_hz[0]), float(band_hz[1])),
         structure or ModelStructure(),
-        None,
         bins.u.shape[0] > 1,
     )
-    plan = plan_of(())
     first = plan.bins[0] - bins.first_bin
     if first < 0 or first + plan.bins.size > bins.count:
         raise ValueError(
@@ -132,23 +124,22 @@ def identify_poles_from_bins(
     u, y = bins.u[:, here], bins.y[:, here]
     if u.shape[0] == 1:
         u, y = u[0], y[0]
-    return _of_plan(plan_of, u, y, notes)
+    return _of_plan(plan, u, y).noting(*notes)
 
 
-def _of_plan(plan_of: PlanOf, u: ComplexArray, y: ComplexArray, notes: Sequence[str] = ()) -> Poles:
+def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
     """Poles from bins: by all as excitation, without tones, with drift, as the record asks for."""
-    plan = plan_of(())
     batch = plan.from_bins(u, y)
     poles = _poles_with_all_bins(plan, u, y, batch)
     if poles is not None:
-        return replace(poles, message="; ".join(filter(None, [poles.message, *notes])))
-    rest, tones = poles_without_tones(plan_of, u, y, batch)
+        return poles
+    rest, tones = poles_without_tones(plan, u, y, batch)
     if y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
         found = poles_with_drift(plan, u, y, batch)
         # a drift fills the bins beside a line as tones would: what leaves less noise is right
         if found is not None and (not tones or found[1] < rest.noise_variance[0]):
-            return replace(found[0], message="; ".join(filter(None, [found[0].message, *notes])))
-    return single(rest, notes=[*(tone.text("left out") for tone in tones), *notes])
+            return found[0]
+    return single(rest, notes=[tone.text("left out") for tone in tones])
 
 
 @lru_cache(maxsize=32)
@@ -159,9 +150,7 @@ def _plan(
     harmonics: bytes,
     band_hz: tuple[float, float],
     structure: ModelStructure,
-    input_noise_ratio: float | None,
     several: bool,
-    left_out: tuple[int, ...],
 ) -> JointPlan:
     return (PoleEstimator if several else JointPlan)(
         sample_rate_hz,
@@ -170,8 +159,6 @@ def _plan(
         np.frombuffer(harmonics, np.int64),
         band_hz,
         structure,
-        input_noise_ratio=input_noise_ratio,
-        left_out=left_out,
     )
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,8 +39,7 @@ class OrderChoice:
         """Of the chosen structure; the message says that it was chosen."""
         poles = self.poles[self.chosen]
         orders = f"{poles.structure.order} and {poles.structure.numerator_order}"
-        note = f"orders {orders} chosen by description length from {len(self.mdl)}"
-        return replace(poles, message="; ".join(filter(None, [poles.message, note])))
+        return poles.noting(f"orders {orders} chosen by description length from {len(self.mdl)}")
 
     @property
     def structure(self) -> ModelStructure:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -166,6 +166,10 @@ class Poles:
     def bands(self) -> tuple[Poles, ...]:
         """Of each band, the first being these."""
         return (self, *self.further)
+
+    def noting(self, *notes: str) -> Poles:
+        """With notes added to the message; empty ones are none."""
+        return replace(self, message="; ".join(filter(None, [self.message, *notes])))
 
     @property
     def best_covariance(self) -> FloatArray:

@@ -8,8 +8,8 @@ fit is tested (`outliers`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy import special
@@ -26,8 +26,6 @@ from tactile_resonance.poles.outliers import (
 )
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.tones import ROUNDING, Tone
-
-PlanOf = Callable[[tuple[int, ...]], JointPlan]
 
 NEAR_BINS = 0.75
 """So near a tone bins are left out; further away what leaks is taken off."""
@@ -74,6 +72,12 @@ class _Taken:
         return Tone(self.at * plan.resolution_hz, rms_v, self.channel, plan.resolution_hz)
 
 
+@lru_cache(maxsize=32)
+def _leaving_out(plan: JointPlan, bins: tuple[int, ...]) -> JointPlan:
+    """The plan without some bins; the latest ones are kept, for a tone is in many records."""
+    return replace(plan, left_out=bins)
+
+
 @dataclass(frozen=True, eq=False)
 class _Fitted:
     """A fit without the tones taken, and the data that it saw, (M, K) without what leaks out of these."""
@@ -85,9 +89,11 @@ class _Fitted:
 
     @classmethod
     def without(
-        cls, plan_of: PlanOf, u: ComplexArray, y: ComplexArray, taken: list[_Taken]
+        cls, plan: JointPlan, u: ComplexArray, y: ComplexArray, taken: list[_Taken]
     ) -> _Fitted:
-        plan = plan_of(tuple(sorted(frozenset().union(*(tone.bins for tone in taken)))))
+        if taken:
+            bins = frozenset().union(*(tone.bins for tone in taken))
+            plan = _leaving_out(plan, tuple(sorted(bins)))
         shape = np.shape(y)
         rest = {"actuator": np.atleast_2d(u), "sensor": np.atleast_2d(y)}
         for tone in taken:
@@ -97,7 +103,7 @@ class _Fitted:
 
 
 def poles_without_tones(
-    plan_of: PlanOf, u: ComplexArray, y: ComplexArray, batch: PolesBatch
+    plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch
 ) -> tuple[PolesBatch, tuple[Tone, ...]]:
     """Poles of one point, bins with a tone left out and what leaks out of them taken off.
 
@@ -105,12 +111,12 @@ def poles_without_tones(
 
     Parameters
     ----------
-    plan_of : callable
-        The plan that leaves out some bins.
+    plan : JointPlan
+        That leaves out none.
     u, y : (K,) or (M, K) complex
         At the bins of its band.
     batch : PolesBatch
-        Of the plan that leaves out none, shape ().
+        Its fit, shape ().
 
     Returns
     -------
@@ -121,23 +127,23 @@ def poles_without_tones(
         other than tones is wrong, or where the fit without them finds no minimum.
     """
     taken: list[_Taken] = []
-    whole = fitted = _Fitted(plan_of(()), batch, np.atleast_2d(u), np.atleast_2d(y))
+    whole = fitted = _Fitted(plan, batch, np.atleast_2d(u), np.atleast_2d(y))
     try:
         while (found := _most_striking(fitted)) is not None:
-            taken, fitted = _taken_too(plan_of, u, y, taken, *found)
+            taken, fitted = _taken_too(plan, u, y, taken, *found)
             if len(taken) > MOST_TONES:
                 return whole.batch, ()
         # a large tone bends the fit, and then others that are none stand out too
         for tone in sorted(taken, key=lambda tone: np.sum(np.abs(tone.phasor) ** 2)):
             fewer = [other for other in taken if other is not tone]
-            if fewer and _most_striking(again := _Fitted.without(plan_of, u, y, fewer)) is None:
+            if fewer and _most_striking(again := _Fitted.without(plan, u, y, fewer)) is None:
                 taken, fitted = fewer, again
         sure = [tone for tone in taken if _stands_alone(fitted, tone)]
         if fitted.batch.has_status(PolesStatus.MODEL_ERROR):
             # what the model leaves out, or distortion, may be that large on a single line
             sure = [tone for tone in sure if not tone.on_line_of(fitted.plan)]
         if len(sure) < len(taken):
-            taken, fitted = sure, _Fitted.without(plan_of, u, y, sure)
+            taken, fitted = sure, _Fitted.without(plan, u, y, sure)
     except ValueError:  # too few lines are left
         return whole.batch, ()
     lost = fitted.batch.has_status(PolesStatus.NOT_CONVERGED) and not whole.batch.has_status(
@@ -150,25 +156,25 @@ def poles_without_tones(
 
 
 def _taken_too(
-    plan_of: PlanOf, u: ComplexArray, y: ComplexArray, taken: list[_Taken], k: int, channel: str
+    plan: JointPlan, u: ComplexArray, y: ComplexArray, taken: list[_Taken], k: int, channel: str
 ) -> tuple[list[_Taken], _Fitted]:
     """With the tone at bin k, estimated from fits that leave it out."""
     for tone in taken:
         if any(abs(k - n) == 1 for n in tone.bins):  # it is not steady
             wider = replace(tone, bins=tone.bins | {k})
             now = [wider if other is tone else other for other in taken]
-            return now, _Fitted.without(plan_of, u, y, now)
+            return now, _Fitted.without(plan, u, y, now)
     tone = _Taken(channel, float(k), np.zeros(len(np.atleast_2d(y)), complex), frozenset({k}))
-    fitted = _Fitted.without(plan_of, u, y, [*taken, tone])
+    fitted = _Fitted.without(plan, u, y, [*taken, tone])
     for _ in range(MOST_RETURNS):
-        plan = fitted.plan
+        here = fitted.plan
         rest = fitted.u if channel == "actuator" else _Model(fitted).errors()
-        unknown = plan.bins[plan.driven] if channel == "actuator" else plan.excited_bins
-        at, phasor = _tone_near(plan, rest + tone.leak(plan), k, unknown)
-        near = plan.bins[np.abs(plan.bins - at) <= NEAR_BINS]
+        unknown = here.bins[here.driven] if channel == "actuator" else here.excited_bins
+        at, phasor = _tone_near(here, rest + tone.leak(here), k, unknown)
+        near = here.bins[np.abs(here.bins - at) <= NEAR_BINS]
         moved = abs(at - tone.at)
         tone = _Taken(channel, at, phasor, tone.bins | {int(n) for n in near})
-        fitted = _Fitted.without(plan_of, u, y, [*taken, tone])
+        fitted = _Fitted.without(plan, u, y, [*taken, tone])
         if moved < 0.01:
             break
     return [*taken, tone], fitted

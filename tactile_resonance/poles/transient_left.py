@@ -84,7 +84,7 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
         )
     else:
         note = _light_damping(frf, poles)
-    return replace(poles, message="; ".join(filter(None, [poles.message, note])))
+    return poles.noting(note)
 
 
 def _beside(frf: FRF, poles: Poles, mode: int) -> float:
