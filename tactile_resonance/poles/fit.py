@@ -8,6 +8,7 @@ does not converge, has many poles or a pure delay is fitted by scipy's least squ
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -76,10 +77,15 @@ class Solution:
         arrays = {f.name: getattr(self, f.name) for f in fields(Solution)}
         return replace(self, **{name: x[which] for name, x in arrays.items() if len(x)})
 
+    @classmethod
+    def joined(cls, solutions: Sequence[Solution]) -> Solution:
+        """Of the points of all."""
+        return cls(*(np.concatenate([getattr(s, f.name) for s in solutions]) for f in fields(cls)))
+
     def put(self, which: npt.NDArray, others: Solution) -> None:
-        """Write other solutions in place of some."""
+        """Write other solutions in place of some; what undriven bins show stays as it was found."""
         for f in fields(Solution):
-            if getattr(self, f.name).size:
+            if f.name not in ("noise", "plain") and getattr(self, f.name).size:
                 getattr(self, f.name)[which] = getattr(others, f.name)
 
     def sandwich(self, normal: FloatArray, shared: int) -> FloatArray:
@@ -116,31 +122,7 @@ def refit_failed(problem: Problem, solution: Solution, data: BinData) -> None:
     for k in np.flatnonzero(~solution.converged & solution.plain):
         found = least_squares(problem, data.rows(slice(k, k + 1)))
         if found.converged:
-            _place(problem, found, solution, int(k))
-
-
-def _place(problem: Problem, found: DenseSolution, whole: Solution, k: int) -> None:
-    records, undriven = whole.theta.shape[1], problem.undriven
-    whole.converged[k] = True
-    whole.theta[k] = found.theta_of(problem, records)
-    inverse, whole.condition[k] = found.inverse()
-    a, b, own = problem.sizes
-    shared = a + b
-    for m in range(records):
-        columns = np.r_[:shared, shared + m * own : shared + (m + 1) * own]
-        jacobian = found.jacobian[m][..., columns]  # (K, 2, n)
-        whole.marginal[k, m] = inverse[np.ix_(columns, columns)]
-        for part, here in enumerate((slice(0, undriven), slice(undriven, None))):
-            rows = jacobian[here].reshape(-1, columns.size)
-            normal = rows.T @ rows
-            if records > 1:
-                whole.normal[k, m, part] = normal
-            taken = float(np.sum(whole.marginal[k, m] * normal))
-            whole.leverage[k, part] = taken + (whole.leverage[k, part] if m else 0.0)
-    power = np.sum(found.residual.real**2 + found.residual.imag**2, axis=0)
-    whole.part_cost[k] = power[:undriven].sum(), power[undriven:].sum()
-    whole.cost[k] = whole.part_cost[k].sum()
-    whole.residual[k] = found.turned
+            solution.put(np.array([k]), found.solution(problem, *found.inverse()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,13 +153,36 @@ class DenseSolution:
         """Sum of the squared residuals."""
         return float(np.sum(self.residual.real**2 + self.residual.imag**2))
 
-    def theta_of(self, problem: Problem, records: int) -> FloatArray:
-        """(M, n) coefficients of each record."""
+    def solution(self, problem: Problem, inverse: FloatArray, condition: float) -> Solution:
+        """The same of a batch of one, with its `inverse` or `covariance`; a delay stays last in theta."""
+        records, undriven = len(self.jacobian), problem.undriven
         a, b, own = problem.sizes
-        out = np.empty((records, a + b + own))
-        out[:, : a + b] = self.theta[: a + b]
-        out[:, a + b :] = self.theta[a + b : a + b + records * own].reshape(records, own)
-        return out
+        shared, n = a + b, self.theta.size - (records - 1) * own
+        theta, normal = np.empty((1, records, n)), np.empty((1, records, 2, n, n))
+        marginal, leverage = np.empty((1, records, n, n)), np.zeros((1, 2))
+        for m in range(records):
+            of_record = np.arange(shared + m * own, shared + (m + 1) * own)
+            columns = np.r_[:shared, of_record, shared + records * own : self.theta.size]
+            theta[0, m], marginal[0, m] = self.theta[columns], inverse[np.ix_(columns, columns)]
+            for part, here in enumerate((slice(0, undriven), slice(undriven, None))):
+                rows = self.jacobian[m, here][..., columns].reshape(-1, n)
+                normal[0, m, part] = rows.T @ rows
+            leverage[0] += np.sum(marginal[0, m] * normal[0, m], axis=(-2, -1))
+        power = np.sum(self.residual.real**2 + self.residual.imag**2, axis=0)
+        part_cost = np.array([[power[:undriven].sum(), power[undriven:].sum()]])
+        return Solution(
+            theta,
+            part_cost.sum(axis=1),
+            part_cost,
+            self.turned[None],
+            np.array([self.converged]),
+            normal if records > 1 else normal[:0],
+            marginal,
+            np.array([condition]),
+            leverage,
+            np.full((1, 2), np.nan),
+            np.ones(1, bool),
+        )
 
     def inverse(self) -> tuple[FloatArray, float]:
         """Inverse of the normal matrix and its condition number, as `likelihood.invert` has them."""

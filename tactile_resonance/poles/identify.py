@@ -7,15 +7,13 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.poles.covariance import modes_in_band
-from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.inputs import checked_band, checked_frf, checked_spectra
 from tactile_resonance.poles.judgement import Judged, assemble
 from tactile_resonance.poles.line_tones import poles_without_tones
-from tactile_resonance.poles.line_weights import lines_of_frf, lines_of_spectra
+from tactile_resonance.poles.line_weights import WeightedLines, lines_of_frf, lines_of_spectra
 from tactile_resonance.poles.lines_fit import LinesPlan
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, systematic_of
-from tactile_resonance.poles.noise_level import KINDS, VarianceModel
+from tactile_resonance.poles.noise_level import KINDS
 from tactile_resonance.poles.result import Poles, PolesBatch
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
@@ -117,19 +115,13 @@ def identify_batch(
     frf = checked_frf(frf)
     band_hz = checked_band(frf.frequency_hz, band_hz)
     selected = frf.band(*band_hz)
-    lines = lines_of_frf(selected)
     return _identify(
         selected.frequency_hz,
-        lines.data,
-        lines.known,
-        lines.usable,
+        lines_of_frf(selected),
         structure,
         band_hz,
-        shape=frf.g.shape[:-1],
-        method="weighted least squares",
-        level_known=lines.level_known,
-        noise=lines.noise,
-        total_known=selected.variance_total is not None,
+        frf.g.shape[:-1],
+        "weighted least squares",
     )
 
 
@@ -196,76 +188,71 @@ def identify_spectra(
     frequency_hz, spectra, covariance = checked_spectra(frequency_hz, spectra, covariance, dof)
     band_hz = checked_band(frequency_hz, band_hz)
     inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
-    lines = lines_of_spectra(spectra[..., inside], covariance[..., inside], dof, pooled)
     return _identify(
         frequency_hz[inside],
-        lines.data,
-        lines.known,
-        lines.usable,
+        lines_of_spectra(spectra[..., inside], covariance[..., inside], dof, pooled),
         structure,
         band_hz,
-        shape=spectra.shape[:-2],
-        method="sample maximum likelihood, errors in variables",
-        level_known=lines.level_known,
+        spectra.shape[:-2],
+        "sample maximum likelihood, errors in variables",
     )
 
 
 def _identify(
     frequency_hz: FloatArray,
-    data: BinData,
-    known: VarianceModel,
-    usable: BoolArray,
+    lines: WeightedLines,
     structure: ModelStructure,
     band_hz: tuple[float, float],
-    *,
     shape: tuple[int, ...],
     method: str,
-    level_known: BoolArray,
-    noise: FloatArray | None = None,
-    total_known: bool = False,
 ) -> PolesBatch:
-    lines = usable.sum(axis=-1)
-    batch = lines.size
-    parameters = structure.parameters
-    if frequency_hz.size < structure.fewest_lines or batch == 0:
+    data, used = lines.data, lines.usable.sum(axis=-1)
+    if frequency_hz.size < structure.fewest_lines or used.size == 0:
         # bases need points: any will do, nothing is fitted
         places = max(structure.order, structure.numerator_order) + 1
         plan = LinesPlan.on_lines(np.linspace(1.0, 2.0, places), structure, band_hz)
-        nothing = _nothing(plan, lines)
-        return assemble(nothing, plan.model_of(nothing.theta), structure, band_hz, shape, method)
-    plan = LinesPlan.on_lines(frequency_hz, structure, band_hz)
-    fit = plan.fit(data)
-    covariance = fit.covariance * known.information_correction[:, None, None]
-    total = covariance if total_known else None
-    if noise is not None:
-        covariance = plan.propagated(fit, data, noise)
+        judged = _nothing(plan, used)
+    else:
+        plan, judged = _judged(LinesPlan.on_lines(frequency_hz, structure, band_hz), lines, used)
+    return assemble(
+        plan, judged, shape, method, lambda less, rows: less.fit(data.rows(rows))[1].cost
+    )
+
+
+def _judged(
+    plan: LinesPlan, lines: WeightedLines, used: IntArray
+) -> tuple[LinesPlan, Judged]:
+    """What fits to lines are worth, of which so many are used (batch,), and the plan of the coefficients."""
+    parameters, known, level_known = plan.structure.parameters, lines.known, lines.level_known
+    of_fit, fit = plan.fit(lines.data)
+    residual = fit.residual[:, 0]
+    plain = 0.5 * fit.marginal[:, 0]  # where the variance of each line is the one weighted with
+    covariance = plain * known.information_correction[:, None, None]
+    total = covariance if lines.total_known else None
+    if lines.noise is not None:
+        covariance = of_fit.propagated(fit, lines.data, lines.noise)
     cost, expected = fit.cost, known.expected_cost(parameters)
     suspect = level_known & known.contradicts(cost, parameters, MODEL_ERROR_PROBABILITY)
-    suspect |= are_smooth(fit.residual, parameters)
+    suspect |= are_smooth(residual, parameters)
     kind = known.kind
     if not level_known.all():
         # the residuals are all there is: they hold noise, distortion and model error together
-        level = fit.cost / np.maximum(lines - parameters / 2, 0.5)
+        level = fit.cost / np.maximum(used - parameters / 2, 0.5)
         unknown = np.full_like(covariance, np.nan)
         covariance = _where(level_known, covariance, unknown)
-        from_residuals = fit.covariance * level[:, None, None]
+        from_residuals = plain * level[:, None, None]
         total = _where(level_known, unknown if total is None else total, from_residuals)
         # what rounding leaves of exact data says nothing
         suspect &= level_known | (level > ROUNDED)
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
         kind = np.where(level_known, kind, len(KINDS))
-    needed = np.zeros((batch, structure.order // 2), bool)  # none is dispensable
-    systematic = np.zeros((*needed.shape, 2, 2))
-    if suspect.any():
-        rows = np.flatnonzero(suspect)
-        poles = modes_in_band(fit.model.poles_rad_s()[rows], band_hz)
-        systematic[rows] = systematic_of(plan, data.rows(rows), poles)
-    judged = Judged(
-        theta=fit.theta,
-        lines=lines,
-        condition=fit.condition_number,
+    judged = Judged.of(
+        plan,
+        used,
+        theta=fit.theta[:, 0],
+        condition=fit.condition,
         converged=fit.converged,
-        residual=fit.residual,
+        residual=residual,
         cost=cost,
         expected=expected,
         suspect=suspect,
@@ -273,32 +260,21 @@ def _identify(
         total=total,
         kind=kind,
         level_known=level_known,
-        noise=np.full((batch, 2), np.nan),
-        systematic=systematic,
-        lacking=np.full((batch, 3), np.nan),
-        dispensable=needed if fit.dispensable is None else fit.dispensable,
-        remark=np.full(batch, "", object),
+        systematic=systematic_of(plan, lines.data, fit.theta, suspect, of_fit),
+        dispensable=of_fit.dispensable(lines.data, fit),
     )
-    less = plan.poorer
-    return assemble(
-        judged,
-        fit.model,
-        structure,
-        band_hz,
-        shape,
-        method,
-        None if less is None else lambda rows: less.fit(data.rows(rows)).cost,
-    )
+    return of_fit, judged
 
 
-def _nothing(plan: LinesPlan, lines: IntArray) -> Judged:
+def _nothing(plan: LinesPlan, used: IntArray) -> Judged:
     """Of too few lines: NaN."""
-    batch, structure = lines.size, plan.structure
+    batch, parameters = used.size, plan.structure.parameters
     nan, no = np.full(batch, np.nan), np.zeros(batch, bool)
-    matrix = np.full((batch, structure.parameters, structure.parameters), np.nan)
-    return Judged(
-        theta=np.full((batch, sum(plan.problem.sizes)), np.nan),
-        lines=np.minimum(lines, structure.fewest_lines - 1),
+    matrix = np.full((batch, parameters, parameters), np.nan)
+    return Judged.of(
+        plan,
+        np.minimum(used, plan.structure.fewest_lines - 1),
+        theta=np.full((batch, parameters), np.nan),
         condition=nan,
         converged=no,
         residual=np.zeros((batch, 0), complex),
@@ -308,12 +284,6 @@ def _nothing(plan: LinesPlan, lines: IntArray) -> Judged:
         covariance=matrix,
         total=matrix,
         kind=np.full(batch, -1),
-        level_known=~no,
-        noise=np.full((batch, 2), np.nan),
-        systematic=np.zeros((batch, structure.order // 2, 2, 2)),
-        lacking=np.full((batch, 3), np.nan),
-        dispensable=np.zeros((batch, structure.order // 2), bool),
-        remark=np.full(batch, "", object),
     )
 
 

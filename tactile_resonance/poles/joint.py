@@ -28,15 +28,14 @@ from tactile_resonance.poles.basis import (
     default_transient_terms,
     transient_basis,
 )
-from tactile_resonance.poles.covariance import modes_in_band
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import Solution, minimise
+from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint_fit import fit_records
 from tactile_resonance.poles.joint_noise import NoiseBands
 from tactile_resonance.poles.judgement import assemble
 from tactile_resonance.poles.lacking import Directions
-from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON, poles_and_covariance, poorer, richer
+from tactile_resonance.poles.model import Variable
+from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.starts import best_of_split
 from tactile_resonance.poles.structure import ModelStructure
@@ -46,7 +45,7 @@ METHOD = "joint maximum likelihood of poles and transient"
 
 
 @dataclass(frozen=True, eq=False)
-class JointPlan:
+class JointPlan(FitPlan):
     """Poles from records of one kind, one a point: all that does not depend on the samples, made once.
 
     Parameters
@@ -156,15 +155,12 @@ class JointPlan:
     def _poles(self, u: ComplexArray, y: ComplexArray, method: str) -> PolesBatch:
         *shape, records, size = y.shape
         u, y = (values.reshape(-1, records, size) for values in (u, y))
-        judged, less = fit_records(self, u, y), self.poorer
         return assemble(
-            judged,
-            self.model_of(judged.theta),
-            self.structure,
-            self.band_hz,
+            self,
+            fit_records(self, u, y),
             tuple(shape),
             method,
-            None if less is None else lambda rows: fit_records(less, u[rows], y[rows]).cost,
+            lambda plan, rows: fit_records(plan, u[rows], y[rows]).cost,
         )
 
     def _checked(self, u: ComplexArray, y: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
@@ -278,20 +274,12 @@ class JointPlan:
         """Whether the noise of one record is known from more than the residuals."""
         return self.other_bins.size > 0 or self.input_noise_ratio is not None
 
-    @cached_property
-    def richer(self) -> JointPlan | None:
-        """With one mode more; None where the band holds too few lines for it."""
+    def with_structure(self, structure: ModelStructure) -> JointPlan | None:
+        """The plan of another structure; None where the band holds too few lines for it."""
         try:
-            plan = replace(self, structure=richer(self.structure), transient_terms=None)
+            return replace(self, structure=structure, transient_terms=None)
         except ValueError:
             return None
-        return plan
-
-    @cached_property
-    def poorer(self) -> JointPlan | None:
-        """With one mode less; None where the model has none to spare."""
-        structure = poorer(self.structure)
-        return None if structure is None else replace(self, structure=structure, transient_terms=None)
 
     def noise_bands(self, records: int) -> NoiseBands:
         """Pieces of the band, for so many records of a point."""
@@ -327,45 +315,16 @@ class JointPlan:
         of_a, of_c = self.denominator_basis.values[at], self.transient_on_bins[at]
         return of_a, self.numerator_basis.values, of_c
 
-    def model_of(self, theta: FloatArray) -> RationalModel:
-        """The model of coefficients (batch, n)."""
-        a, b, _ = self.problem.sizes
-        return RationalModel(
-            denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
-            numerator=theta[:, a : a + b],
-            transient=theta[:, a + b :],
-            variable=self.variable,
-            denominator_basis=self.denominator_basis,
-            numerator_basis=self.numerator_basis,
-        )
-
-    def poles_in_band(self, theta: FloatArray) -> ComplexArray:
-        """(batch, places) poles [rad/s] of coefficients (batch, n)."""
-        roots = self.denominator_basis.roots(self.problem.split(theta)[0])
-        return modes_in_band(self.variable.to_s(roots)[0], self.band_hz)
-
-    def compared(self, data: BinData, start: FloatArray | None = None) -> ComplexArray:
-        """Poles (points, places) of a fit of few iterations that others are compared with."""
-        return self.poles_in_band(minimise(self.problem, data, start, COMPARISON).theta[:, 0])
-
     def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
-        """Poles of a fit and their covariance; see `model_error.poles_and_covariance`."""
+        """Poles of a fit, in the band or not, and their covariance as its residuals show it."""
         solution = minimise(self.problem, data)
-        poles, covariance, lost = self._with_covariance(data, solution)
+        poles, covariance, lost = self.poles_and_covariance(data, solution)
         rows = np.flatnonzero(lost)
         if rows.size:  # where noise took a mode, two may be behind the other one
-            part, again = data.rows(rows), solution.rows(rows)
-            again = best_of_split(self.problem, part, self.model_of(again.theta[:, 0]), again)
-            poles[rows], covariance[rows], _ = self._with_covariance(part, again)
+            part = data.rows(rows)
+            again = best_of_split(self, part, solution.rows(rows))
+            poles[rows], covariance[rows], _ = self.poles_and_covariance(part, again)
         return poles, covariance
-
-    def _with_covariance(
-        self, data: BinData, solution: Solution
-    ) -> tuple[ComplexArray, FloatArray, BoolArray]:
-        a, b, own = self.problem.sizes
-        dof = data.records * (data.undriven + data.driven - own / 2) - (a + b) / 2
-        model = self.model_of(solution.theta[:, 0])
-        return poles_and_covariance(model, solution.marginal[:, 0], solution.cost, dof)
 
     @property
     def _between(self) -> BoolArray:

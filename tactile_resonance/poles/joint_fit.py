@@ -205,8 +205,7 @@ def _fit(
         data = plain.weighted(rest=variance_y, variance_y=variance_y, variance_u=noise[:, 1:])
     refit_failed(plan.problem, solution, data)
     if plan.structure.order >= SEVERAL_MODES:
-        model = plan.model_of(solution.theta[:, 0])
-        solution = best_of_split(plan.problem, data, model, solution)
+        solution = best_of_split(plan, data, solution)
     last = not _returns(plan, plain.records)
     judge = _several if plain.records > 1 else partial(_alone, last=last)
     judged = judge(_Round(plan, plain, data, solution, noise, np.zeros(len(y), np.int64)))
@@ -259,9 +258,10 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     # real and imaginary part of a circular complex error have half its variance each
     covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
     known = plan.level_known
-    return Judged(
+    return Judged.of(
+        plan,
+        np.where(_usable(fitted.plain, solution.cost), plan.excited_at.size, 0),
         theta=theta,
-        lines=np.where(_usable(fitted.plain, solution.cost), plan.excited_at.size, 0),
         condition=solution.condition,
         converged=solution.converged,
         residual=residual,
@@ -273,21 +273,9 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         kind=fitted.kind,
         level_known=np.full(batch, known),
         noise=level.noise,
-        systematic=_systematic(plan, data, solution.theta, wrong),
+        systematic=systematic_of(plan, data, solution.theta, wrong),
         lacking=lacking,
-        dispensable=np.zeros((batch, plan.structure.order // 2), bool),
-        remark=np.full(batch, "", object),
     )
-
-
-def _systematic(plan: JointPlan, data: BinData, theta: FloatArray, wrong: BoolArray) -> FloatArray:
-    """(batch, places, 2, 2) of `model_error.systematic_of` where the model is wrong, else 0."""
-    systematic = np.zeros((wrong.size, plan.structure.order // 2, 2, 2))
-    if wrong.any():
-        rows = np.flatnonzero(wrong)
-        poles = plan.poles_in_band(theta[rows, 0])
-        systematic[rows] = systematic_of(plan, data.rows(rows), poles, theta[rows])
-    return systematic
 
 
 def _mean_power(data: BinData) -> FloatArray:
@@ -361,11 +349,12 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     suspect |= levels.contradicts
     covariance, total = fitted.covariances(suspect)
     theta = solution.theta
-    judged = Judged(
+    judged = Judged.of(
+        plan,
+        np.where(_usable(fitted.plain, solution.cost), plan.excited_at.size, 0),
         theta=np.concatenate(
             [theta[:, 0, : a + b], theta[..., a + b :].reshape(batch, records * own)], axis=1
         ),
-        lines=np.where(_usable(fitted.plain, solution.cost), plan.excited_at.size, 0),
         condition=solution.condition,
         converged=solution.converged,
         residual=common,
@@ -375,12 +364,8 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
         covariance=covariance,
         total=total,
         kind=fitted.kind,
-        level_known=np.ones(batch, bool),
         noise=fitted.noise * levels.noise_level(suspect)[:, None],
-        systematic=_systematic(plan, fitted.data, theta, suspect),
-        lacking=np.full((batch, 3), np.nan),
-        dispensable=np.zeros((batch, plan.structure.order // 2), bool),
-        remark=np.full(batch, "", object),
+        systematic=systematic_of(plan, fitted.data, theta, suspect),
     )
     return _each_by_itself(judged, total, first)
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.covariance import pole_quantities, propagated
-from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.model_error import model_error_factor
 from tactile_resonance.poles.noise_level import KINDS
+from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.result import STATUS_CODE, PolesBatch, PolesStatus
 from tactile_resonance.poles.significance import (
     beside_others,
@@ -21,7 +22,8 @@ from tactile_resonance.poles.significance import (
     second_order,
     significant_modes,
 )
-from tactile_resonance.poles.structure import ModelStructure
+
+Plan = TypeVar("Plan", bound=FitPlan)
 
 # Beyond this the parameters have no figure left in double precision.
 LARGEST_CONDITION_NUMBER = 1e12
@@ -87,6 +89,20 @@ class Judged:
     dispensable: BoolArray
     remark: npt.NDArray[np.object_]
 
+    @classmethod
+    def of(cls, plan: FitPlan, lines: IntArray, **values: Any) -> Judged:
+        """With a known level of noise, and nothing to remark, of what no value is given for."""
+        batch, places = lines.size, plan.structure.order // 2
+        nothing = {
+            "level_known": np.ones(batch, bool),
+            "noise": np.full((batch, 2), np.nan),
+            "systematic": np.zeros((batch, places, 2, 2)),
+            "lacking": np.full((batch, 3), np.nan),
+            "dispensable": np.zeros((batch, places), bool),
+            "remark": np.full(batch, "", object),
+        }
+        return cls(lines=lines, **{**nothing, **values})
+
     def put(self, rows: IntArray, others: Judged) -> None:
         """Write other points in place of some."""
         for f in fields(self):
@@ -112,29 +128,26 @@ class Judged:
 
 
 def assemble(
+    plan: Plan,
     judged: Judged,
-    model: RationalModel,
-    structure: ModelStructure,
-    band_hz: tuple[float, float],
     shape: tuple[int, ...],
     method: str,
-    costs_with_less: Callable[[IntArray], FloatArray] | None = None,
+    costs: Callable[[Plan, IntArray], FloatArray],
 ) -> PolesBatch:
     """The result of a batch.
 
     Parameters
     ----------
+    plan : FitPlan
+        Of the coefficients.
     judged : Judged
-    model : RationalModel
-        Of its coefficients.
-    structure : ModelStructure
-    band_hz : (low, high)
     shape : tuple of int
         Leading axes, of as many points as the batch has.
     method : str
-    costs_with_less : callable, optional
-        Costs (rows,) of some points, fitted with one mode less; see `_needed`.
+    costs : callable
+        Costs (rows,) of some points fitted by another plan, with one mode less; see `_needed`.
     """
+    structure, band_hz, model = plan.structure, plan.band_hz, plan.model_of(judged.theta)
     enough = judged.lines >= structure.fewest_lines
     conditioned = judged.condition < LARGEST_CONDITION_NUMBER
     # a model that the lines do not determine has no poles worth a number
@@ -166,9 +179,8 @@ def assemble(
     significant &= ~judged.dispensable
     if poles.shape[-1] > 2:
         significant &= ~_sum_of_hidden(poles, significant)
-    if costs_with_less is not None:
-        certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
-        significant |= _needed(judged, structure, poles, significant, certain, costs_with_less)
+    certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
+    significant |= _needed(plan, judged, poles, significant, certain, costs)
     remark = _without_lost_totals(quantities["total_covariance"], significant, judged.remark)
     if poles.shape[-1] > 1:
         remark = _widen(quantities, second_order(poles, significant, distance), remark)
@@ -207,7 +219,7 @@ def assemble(
             model,
             denominator=batch(model.denominator),
             numerator=batch(model.numerator),
-            transient=batch(model.transient) if model.transient.ndim > 1 else model.transient,
+            transient=batch(model.transient),
             delay_s=batch(np.asarray(delay)) if np.ndim(delay) else delay,
         ),
         structure=structure,
@@ -228,24 +240,25 @@ def _lost_to_rounding(covariance: FloatArray) -> BoolArray:
 
 
 def _needed(
+    plan: Plan,
     judged: Judged,
-    structure: ModelStructure,
     poles: ComplexArray,
     found: BoolArray,
     asked: BoolArray,
-    costs_with_less: Callable[[IntArray], FloatArray],
+    costs: Callable[[Plan, IntArray], FloatArray],
 ) -> BoolArray:
     """(batch, k) modes beside others whose residue noise could make, but without which the fit is worse.
 
     Two modes nearer than their widths share what the lines say of them, so that the residue of one may be
     uncertain, and only a fit without it tells; see `significance.fall_of_noise`.
     """
-    beside = beside_others(poles, found) & ~judged.dispensable & asked[:, None]
+    less = plan.poorer
+    beside = beside_others(poles, found) & ~judged.dispensable & asked[:, None] & (less is not None)
     rows = np.flatnonzero(beside.any(axis=-1))
-    if rows.size:
+    if less is not None and rows.size:
         lines, expected = judged.lines[rows], judged.expected[rows]
-        level = np.maximum(expected / (lines - structure.parameters / 2), 1)
-        fall = costs_with_less(rows) - judged.cost[rows]
+        level = np.maximum(expected / (lines - plan.structure.parameters / 2), 1)
+        fall = costs(less, rows) - judged.cost[rows]
         beside[rows] &= (fall > level * fall_of_noise(lines))[:, None]
     return beside
 

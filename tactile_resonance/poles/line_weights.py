@@ -33,14 +33,17 @@ class WeightedLines:
         Lines that are not left out.
     level_known : (batch,) bool
         Whether there is a variance above 0 at all; points without are weighted alike on all lines.
+    total_known : bool
+        Whether the variance is of noise and distortion.
     noise : (batch, F) float or None
-        Variance from noise alone, where the one weighted with is of noise and distortion.
+        Variance from noise alone, where it is known as well then.
     """
 
     data: BinData
     known: VarianceModel
     usable: BoolArray
     level_known: BoolArray
+    total_known: bool = False
     noise: FloatArray | None = None
 
 
@@ -76,6 +79,7 @@ def lines_of_frf(frf: FRF) -> WeightedLines:
         known,
         usable,
         level_known,
+        frf.variance_total is not None,
         None if noise is None or frf.variance_total is None else noise.reshape(flat_shape),
     )
 

@@ -8,25 +8,25 @@ Identification: A Frequency Domain Approach*, 2nd ed. (2012), chapter 12).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.basis import PolynomialBasis
-from tactile_resonance.poles.covariance import modes_in_band
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     RULES,
     DenseSolution,
     Linearised,
+    Solution,
     least_squares,
     linear_step,
     minimise,
 )
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.model_error import COMPARISON, poles_and_covariance, poorer, richer
+from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.starts import (
     SEVERAL_MODES,
     best_of_split,
@@ -49,42 +49,10 @@ REBASE_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
-class LinesFit:
-    """Fits of a batch of points on the same lines.
-
-    Attributes
-    ----------
-    theta : (batch, n) float
-        Coefficients [A without its last, B].
-    model : RationalModel
-        Of these, and of a delay.
-    cost : (batch,) float
-    covariance : (batch, n, n) float
-        Of the coefficients, where the variance of each line is the one it was weighted with.
-    condition_number : (batch,) float
-    converged : (batch,) bool
-    residual : (batch, F) complex
-        Weighted residuals; 0 on lines that were left out.
-    jacobian : (batch, F, 2, n) float or None
-        Of real and imaginary parts of the weighted residuals, where each point was fitted alone.
-    dispensable : (batch, places) bool or None
-        Modes in the band without which the fit is as good, where any was looked for; see `starts`.
-    """
-
-    theta: FloatArray
-    model: RationalModel
-    cost: FloatArray
-    covariance: FloatArray
-    condition_number: FloatArray
-    converged: BoolArray
-    residual: ComplexArray
-    jacobian: FloatArray | None = None
-    dispensable: BoolArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class LinesPlan:
+class LinesPlan(FitPlan):
     """What a fit on given lines needs whatever the data.
+
+    Coefficients (batch, n) are [A without its last, B], and a delay over `delay_unit_s` if asked for.
 
     Attributes
     ----------
@@ -93,16 +61,15 @@ class LinesPlan:
     band_hz : (low, high)
     start_size : (F,) float or None
         ``|A|`` that start values begin from, in a rebased plan.
+    weights : pair of (F,) float or None
+        In which the bases of A and of B are orthonormal there.
     """
 
     frequency_hz: FloatArray
     structure: ModelStructure
     band_hz: tuple[float, float]
-    problem: Problem
-    variable: Variable
-    denominator_basis: PolynomialBasis
-    numerator_basis: PolynomialBasis
     start_size: FloatArray | None = None
+    weights: tuple[FloatArray, FloatArray] | None = None
 
     @classmethod
     def on_lines(
@@ -111,65 +78,83 @@ class LinesPlan:
         """Plan with bases orthonormal on the lines; the latest ones are kept."""
         return _plan(np.ascontiguousarray(frequency_hz, float).tobytes(), structure, band_hz)
 
-    @property
-    def richer(self) -> LinesPlan:
-        """With one mode more."""
-        return LinesPlan.on_lines(self.frequency_hz, richer(self.structure), self.band_hz)
+    def with_structure(self, structure: ModelStructure) -> LinesPlan:
+        """The plan of another structure."""
+        return LinesPlan.on_lines(self.frequency_hz, structure, self.band_hz)
 
-    @property
-    def poorer(self) -> LinesPlan | None:
-        """With one mode less; None where the model has none to spare."""
-        less = poorer(self.structure)
-        return None if less is None else LinesPlan.on_lines(self.frequency_hz, less, self.band_hz)
+    @cached_property
+    def variable(self) -> Variable:
+        """Of the polynomials."""
+        return Variable.for_lines(self.frequency_hz, self.structure)
 
-    def fit(self, data: BinData) -> LinesFit:
-        """Fit of all points of a batch."""
-        batch = len(data.y)
+    @cached_property
+    def denominator_basis(self) -> PolynomialBasis:
+        """Orthonormal on the lines."""
+        return self._basis(self.structure.order, 0)
+
+    @cached_property
+    def numerator_basis(self) -> PolynomialBasis:
+        """Orthonormal on the lines."""
+        return self._basis(self.structure.numerator_order, 1)
+
+    def _basis(self, degree: int, which: int) -> PolynomialBasis:
+        x = self.variable.of_frequency(self.frequency_hz)
+        return PolynomialBasis.on_lines(x, degree, self.weights and self.weights[which])
+
+    @cached_property
+    def problem(self) -> Problem:
+        """Driven bins without a transient."""
+        none = np.empty((self.frequency_hz.size, 0), complex)
+        return Problem(self.denominator_basis.values, self.numerator_basis.values, none)
+
+    @cached_property
+    def delay_unit_s(self) -> float:
+        """A radian at the highest line."""
+        return 1 / (2 * np.pi * float(self.frequency_hz.max()))
+
+    @cached_property
+    def _delay_phase(self) -> FloatArray | None:
+        """(F,) phase by a unit of delay; None where none is asked for."""
+        if not self.structure.delay:
+            return None
+        return np.asarray(2 * np.pi * self.frequency_hz * self.delay_unit_s)
+
+    def model_of(self, theta: FloatArray) -> RationalModel:
+        """The model of coefficients (batch, n)."""
+        if not self.structure.delay:
+            return super().model_of(theta)
+        return replace(super().model_of(theta[:, :-1]), delay_s=theta[:, -1] * self.delay_unit_s)
+
+    def fit(self, data: BinData) -> tuple[LinesPlan, Solution]:
+        """Fit of all points of a batch, and the plan of its coefficients, which may have other bases."""
         if self.structure.order > LARGEST_BATCHED_ORDER:
             return self.settled(data)._fit_dense(data)
         if self.structure.delay:
             return self._fit_dense(data)
         solution = minimise(self.problem, data)
         if self.structure.order >= SEVERAL_MODES:
-            solution = best_of_split(
-                self.problem, data, self.model_of(solution.theta[:, 0]), solution
-            )
-        theta, cost, converged = solution.theta[:, 0], solution.cost, solution.converged
-        residual, parameters = solution.residual[:, 0], 0.5 * solution.marginal[:, 0]
-        condition = solution.condition
+            solution = best_of_split(self, data, solution)
+        converged, condition = solution.converged, solution.condition
         doubtful = np.flatnonzero(~converged | ~(condition < NORMAL_EQUATIONS_LIMIT))
-        if batch == 1 and doubtful.size:
+        if len(data.y) == 1 and doubtful.size:
             return self.rebased(data)._fit_dense(data)
         for k in doubtful:
             dense = least_squares(self.problem, data.rows(slice(k, k + 1)))
-            if dense.cost <= cost[k] * (1 + 1e-9) or not converged[k]:
-                theta[k], cost[k], converged[k] = dense.theta, dense.cost, dense.converged
-                residual[k] = dense.turned[0]
-                half, condition[k] = dense.covariance()
-                parameters[k] = 0.5 * half
-        return LinesFit(
-            theta, self.model_of(theta), cost, parameters, condition, converged, residual
-        )
+            if dense.cost <= solution.cost[k] * (1 + 1e-9) or not converged[k]:
+                solution.put(np.array([k]), dense.solution(self.problem, *dense.covariance()))
+        return self, solution
 
-    @np.errstate(over="ignore", invalid="ignore")
-    def compared(self, data: BinData, _: FloatArray | None = None) -> ComplexArray:
-        """Poles (batch, places) in the band of a fit that others are compared with; see `JointPlan`.
-
-        Of the batched solver alone where it is that of `fit`, and of few iterations.
-        """
-        if self.structure.order > LARGEST_BATCHED_ORDER or self.structure.delay:
-            model = self.fit(data).model
-        else:
-            theta = minimise(self.problem, data, None, COMPARISON).theta
-            model = self.model_of(theta[:, 0])
-        return modes_in_band(model.poles_rad_s(), self.band_hz)
+    def compared(self, data: BinData, start: FloatArray | None = None) -> ComplexArray:
+        """As `FitPlan.compared`, from start values; of what the batched solver cannot do a whole fit."""
+        if self.structure.order <= LARGEST_BATCHED_ORDER and not self.structure.delay:
+            return super().compared(data)
+        plan, solution = self.fit(data)
+        return plan.poles_in_band(solution.theta[:, 0])
 
     def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
-        """Poles of a fit and their covariance; see `model_error.poles_and_covariance`."""
-        fit = self.fit(data)
-        dof = data.driven - self.structure.parameters / 2
-        inverse = 2 * fit.covariance
-        return poles_and_covariance(fit.model, inverse, fit.cost, dof)[:2]
+        """Poles of a fit, in the band or not, and their covariance as its residuals show it."""
+        plan, solution = self.fit(data)
+        return plan.poles_and_covariance(data, solution)[:2]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:
@@ -182,44 +167,41 @@ class LinesPlan:
         frequency domain data*, IEEE Trans. Autom. Control 50 (2005) 1835-1839). The first point
         with finite weights stands for all.
         """
-        usable = np.isfinite(data.variance_y).any(axis=-1)
-        row = data.rows(slice(int(np.argmax(usable)), int(np.argmax(usable)) + 1))
-        order = self.structure.order
-        plan = self
+        row, plan = _first_usable(data), self
         size = np.ones(self.frequency_hz.size)
         for _ in range(REBASE_ITERATIONS):
             of_size = plan.of_size(row, size)
             if of_size is None:
                 break
-            plan = replace(of_size, start_size=None)
+            plan = of_size
             theta = linear_step(plan.problem, row, np.sqrt(size))
-            last, size = size, np.abs(plan.problem.denominator @ np.append(theta[:order], 1.0)) ** 2
+            alpha = np.append(theta[: self.structure.order], 1.0)
+            last, size = size, np.abs(plan.problem.denominator @ alpha) ** 2
             if not (np.isfinite(size).all() and (size > 0).all()):
-                break
-            plan = replace(plan, start_size=np.sqrt(size))
+                return replace(plan, start_size=None)
             if np.ptp(np.log(size / last)) < REBASE_TOLERANCE:
                 break
-        return plan
+        return plan if plan is self else replace(plan, start_size=np.sqrt(size))
 
     def settled(self, data: BinData) -> LinesPlan:
         """Plan with bases that suit the deepest minimum of the first point with finite weights."""
         plan = self.rebased(data)
         if self.structure.delay:
             return plan
-        usable = np.isfinite(data.variance_y).any(axis=-1)
-        row = data.rows(slice(int(np.argmax(usable)), int(np.argmax(usable)) + 1))
+        row = _first_usable(data)
         found = least_squares(plan.problem, row, None, None, plan.start_size)
         return exchanged(plan, row, found)[0] if np.isfinite(found.cost) else plan
 
-    def _dispensable(self, solutions: list[DenseSolution], data: BinData, modes: ComplexArray) -> BoolArray:
-        """(batch, places) for which of the modes (batch, places) in the band the others would do."""
-        out = np.zeros(modes.shape, bool)
+    def dispensable(self, data: BinData, solution: Solution) -> BoolArray:
+        """(batch, places) modes in the band without which the fit is as good, where many are fitted."""
+        out = np.zeros((len(data.y), self.structure.order // 2), bool)
         if self.structure.delay or self.structure.order <= LARGEST_BATCHED_ORDER:
             return out
-        for k, solution in enumerate(solutions):
-            if solution.converged:
-                poles = dispensable(self, data.rows(slice(k, k + 1)), solution)
-                out[k] = np.isclose(modes[k][:, None], poles, 1e-6, 0).any(axis=-1)
+        modes = self.poles_in_band(solution.theta[:, 0])
+        for k in np.flatnonzero(solution.converged):
+            row, theta = data.rows(slice(k, k + 1)), solution.theta[k, 0]
+            poles = dispensable(self, row, theta, float(solution.cost[k]))
+            out[k] = np.isclose(modes[k][:, None], poles, 1e-6, 0).any(axis=-1)
         return out
 
     def of_size(self, row: BinData, size: FloatArray) -> LinesPlan | None:
@@ -233,105 +215,64 @@ class LinesPlan:
         mean_y, mean_u = weight_y.mean(), weight_u.mean()
         if not (np.isfinite([mean_y, mean_u]).all() and mean_y > 0 and mean_u > 0):
             return None
-        x, structure = self.variable.of_frequency(self.frequency_hz), self.structure
-        denominator = PolynomialBasis.on_lines(x, structure.order, weight_y / mean_y)
-        numerator = PolynomialBasis.on_lines(x, structure.numerator_order, weight_u / mean_u)
-        if not np.isfinite([denominator.hessenberg.sum(), numerator.hessenberg.sum()]).all():
-            return None
-        problem = Problem.of_lines(denominator.values, numerator.values)
-        return replace(
-            self,
-            problem=problem,
-            denominator_basis=denominator,
-            numerator_basis=numerator,
-            start_size=np.sqrt(size),
-        )
+        weights = weight_y / mean_y, weight_u / mean_u
+        plan = replace(self, start_size=np.sqrt(size), weights=weights)
+        bases = plan.denominator_basis, plan.numerator_basis
+        return plan if np.isfinite([basis.hessenberg.sum() for basis in bases]).all() else None
 
-    def propagated(self, fit: LinesFit, data: BinData, noise: FloatArray) -> FloatArray:
-        """Covariance (batch, n, n) of a fit where the variance (batch, F) is not that of `data`."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            finite = np.isfinite(data.variance_y)
-            if fit.jacobian is None:
-                weighted = data.weighted(
-                    variance_y=np.where(finite, data.variance_y**2 / noise, np.inf)
-                )
-                theta = fit.theta[:, None]
-                normal = likelihood.moments(self.problem.tables, weighted, theta)[2][:, 0, 1]
-            else:
-                ratio = np.where(finite, noise / data.variance_y, 0.0)  # (batch, F)
-                normal = np.einsum("bfpi,bf,bfpj->bij", fit.jacobian, ratio, fit.jacobian)
-        inverse = 2 * fit.covariance
+    @np.errstate(divide="ignore", invalid="ignore")
+    def propagated(self, solution: Solution, data: BinData, noise: FloatArray) -> FloatArray:
+        """Covariance (batch, n, n) of a solution where the variance (batch, F) is not that of `data`."""
+        finite = np.isfinite(data.variance_y)
+        inverse = solution.marginal[:, 0]
+        if self.structure.delay or self.weights is not None:  # fitted point by point
+            normal = np.empty_like(inverse)
+            for k, used in enumerate(finite):
+                row = data.rows(slice(k, k + 1))
+                at = Linearised.of(self.problem, row, solution.theta[k, 0], self._delay_phase)
+                ratio = noise[k, used] / data.variance_y[k, used]
+                jacobian = at.jacobian[0, used]  # (F, 2, n)
+                normal[k] = np.einsum("fpi,f,fpj->ij", jacobian, ratio, jacobian)
+        else:
+            more = np.where(finite, data.variance_y**2 / noise, np.inf)
+            weighted = data.weighted(variance_y=more)
+            normal = likelihood.moments(self.problem.tables, weighted, solution.theta)[2][:, 0, 1]
         return 0.5 * inverse @ normal @ inverse
 
-    def model_of(self, theta: FloatArray, delay_s: FloatArray | float = 0.0) -> RationalModel:
-        """The model with coefficients (batch, n), those of A first."""
-        a, b, _ = self.problem.sizes
-        return RationalModel(
-            denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
-            numerator=np.ascontiguousarray(theta[:, a : a + b]),
-            variable=self.variable,
-            denominator_basis=self.denominator_basis,
-            numerator_basis=self.numerator_basis,
-            delay_s=delay_s,
-        )
-
-    def _fit_dense(self, data: BinData) -> LinesFit:
-        """Point by point, for structures beyond the batched solver."""
-        phase = None
-        unit_s = 1.0
-        if self.structure.delay:
-            unit_s = 1 / (2 * np.pi * float(self.frequency_hz.max()))
-            phase = 2 * np.pi * self.frequency_hz * unit_s
-        solutions = []
+    def _fit_dense(self, data: BinData) -> tuple[LinesPlan, Solution]:
+        """Point by point."""
+        each = []
         for k in range(len(data.y)):
-            row = data.rows(slice(k, k + 1))
-            solutions.append(self._best_of_starts(row, phase))
-        theta = np.stack([s.theta for s in solutions])
-        covariances, conditions = zip(*(s.covariance() for s in solutions), strict=True)
-        delay_s = theta[:, -1] * unit_s if phase is not None else 0.0
-        a, b, _ = self.problem.sizes
-        model = self.model_of(theta, delay_s)
-        modes = modes_in_band(model.poles_rad_s(), self.band_hz)
-        return LinesFit(
-            theta[:, : a + b],
-            model,
-            np.array([s.cost for s in solutions]),
-            0.5 * np.stack(covariances),
-            np.array(conditions),
-            np.array([s.converged for s in solutions]),
-            np.stack([s.turned[0] for s in solutions]),
-            np.stack([s.jacobian[0] for s in solutions]),
-            self._dispensable(solutions, data, modes),
-        )
+            found = self._best_of_starts(data.rows(slice(k, k + 1)))
+            each.append(found.solution(self.problem, *found.covariance()))
+        return self, Solution.joined(each)
 
-    def _best_of_starts(self, row: BinData, phase: FloatArray | None) -> DenseSolution:
+    def _best_of_starts(self, row: BinData) -> DenseSolution:
         """Of several starts the one with the least cost."""
-        solutions = []
-        for start in self._starts(row, phase):
-            solutions.append(least_squares(self.problem, row, start, phase, self.start_size))
+        phase, starts = self._delay_phase, list[FloatArray | None]([None])
+        if phase is not None:
+            starts = delay_starts(self.problem, row, phase)
+        solutions = [
+            least_squares(self.problem, row, start, phase, self.start_size) for start in starts
+        ]
         finite = [s for s in solutions if np.isfinite(s.cost)]
         best = min(finite or solutions, key=lambda s: s.cost)
         if phase is None and finite and self.structure.order > LARGEST_BATCHED_ORDER:
             best = moved_to(self, row, *exchanged(self, row, best))
         return best
 
-    def _starts(self, row: BinData, phase: FloatArray | None) -> list[FloatArray | None]:
-        if phase is None:
-            return [None]
-        return delay_starts(self.problem, row, phase)
-
 
 @lru_cache(maxsize=16)
 def _plan(
     frequency_hz: bytes, structure: ModelStructure, band_hz: tuple[float, float]
 ) -> LinesPlan:
-    lines_hz = np.frombuffer(frequency_hz)
-    variable = Variable.for_lines(lines_hz, structure)
-    x = variable.of_frequency(lines_hz)
-    denominator = PolynomialBasis.on_lines(x, structure.order)
-    numerator = PolynomialBasis.on_lines(x, structure.numerator_order)
-    problem = Problem.of_lines(denominator.values, numerator.values)
-    return LinesPlan(lines_hz, structure, band_hz, problem, variable, denominator, numerator)
+    return LinesPlan(np.frombuffer(frequency_hz), structure, band_hz)
+
+
+def _first_usable(data: BinData) -> BinData:
+    """The first point with finite weights."""
+    k = int(np.argmax(np.isfinite(data.variance_y).any(axis=-1)))
+    return data.rows(slice(k, k + 1))
 
 
 def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[FloatArray | None]:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -60,31 +60,30 @@ class RationalModel:
         Over `denominator_basis`; the last one is 1.
     numerator : (..., m + 1) float
         Over `numerator_basis`.
+    transient : (..., t) float
+        Coefficients of the transient's numerator, none where there is no transient; of several records
+        one after the other.
     variable : Variable
     denominator_basis, numerator_basis : PolynomialBasis
-    transient : (..., t) float
-        Coefficients of the transient's numerator, empty where there is none; of several records
-        one after the other.
     delay_s : (...) float
     """
 
     denominator: FloatArray
     numerator: FloatArray
+    transient: FloatArray
     variable: Variable
     denominator_basis: PolynomialBasis
     numerator_basis: PolynomialBasis
-    transient: FloatArray = field(default_factory=lambda: np.empty(0))
     delay_s: FloatArray | float = 0.0
 
     def at(self, index: tuple[int, ...] | tuple[npt.NDArray[np.intp]]) -> RationalModel:
         """The model of one point of a batch, or of some of them."""
         delay = self.delay_s if np.ndim(self.delay_s) == 0 else np.asarray(self.delay_s)[index]
-        transient = self.transient[index] if self.transient.ndim > 1 else self.transient
         return replace(
             self,
             denominator=self.denominator[index],
             numerator=self.numerator[index],
-            transient=transient,
+            transient=self.transient[index],
             delay_s=delay,
         )
 

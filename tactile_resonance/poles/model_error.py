@@ -3,43 +3,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
-from tactile_resonance.poles.covariance import pole_quantities
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import RULES
-from tactile_resonance.poles.model import RationalModel
+from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.result import natural_frequency_and_damping
-from tactile_resonance.poles.significance import (
-    beside_others,
-    in_any_direction,
-    second_order,
-    significant_modes,
-)
-from tactile_resonance.poles.structure import ModelStructure
-
-if TYPE_CHECKING:
-    from tactile_resonance.poles.joint import JointPlan
-    from tactile_resonance.poles.lines_fit import LinesPlan
+from tactile_resonance.poles.significance import in_any_direction
 
 # A cost that noise alone exceeds once in a thousand fits counts as model error.
 MODEL_ERROR_PROBABILITY = 1e-3
-# Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
-# in particular.
-COMPARISON = RULES._replace(iterations=8)
 
 
 def systematic_of(
-    plan: JointPlan | LinesPlan,
+    plan: FitPlan,
     data: BinData,
-    poles_rad_s: ComplexArray,
-    theta: FloatArray | None = None,
+    theta: FloatArray,
+    wrong: BoolArray,
+    plan_of_theta: FitPlan | None = None,
 ) -> FloatArray:
-    """Outer products of what halves of the data, and one mode more, move each pole by.
+    """Outer products of what halves of the data, and one mode more, move each pole by where a model is wrong.
 
     Halves are those of the driven bins and, of several records, the first and the last ones. Where one of
     these fits has no such mode, or does not determine it, half its width stands for all: what lies nearer to a
@@ -47,35 +30,41 @@ def systematic_of(
 
     Parameters
     ----------
-    plan : JointPlan or LinesPlan
+    plan : FitPlan
     data : BinData
-    poles_rad_s : (points, places) complex
-        Of the fit.
-    theta : (points, M, n) float, optional
-        Of the fit, where those to halves begin; needed of several records.
+    theta : (points, M, n) float
+        Of the fit, where those to halves begin.
+    wrong : (points,) bool
+    plan_of_theta : FitPlan, optional
+        Over whose bases the coefficients are, where not of `plan`.
 
     Returns
     -------
     (points, places, 2, 2) float
-        In (f0_hz, damping_ratio).
+        In (f0_hz, damping_ratio); 0 where the model is not wrong.
     """
+    systematic = np.zeros((wrong.size, plan.structure.order // 2, 2, 2))
+    if not wrong.any():
+        return systematic
+    data, theta = data.rows(np.flatnonzero(wrong)), theta[wrong]
+    poles_rad_s = (plan_of_theta or plan).poles_in_band(theta[:, 0])
     poles = []
     for parity in (0, 1):
         left_out = np.arange(data.driven) % 2 == parity
         half = data.weighted(variance_y=np.where(left_out, np.inf, data.variance_y))
         poles.append(plan.compared(half, theta))
-    systematic = difference_of_halves(*poles)
+    moved = difference_of_halves(*poles)
     half_of = data.records // 2
-    if half_of > 0 and theta is not None:
+    if half_of > 0:
         first, last = slice(0, half_of), slice(data.records - half_of, None)
         poles = [plan.compared(data.part(which), theta[:, which]) for which in (first, last)]
-        systematic = systematic + difference_of_halves(*poles)
+        moved = moved + difference_of_halves(*poles)
     if plan.richer is not None and _fewest_lines(data) > plan.richer.structure.fewest_lines:
-        more = difference_of_models(poles_rad_s, *plan.richer.with_covariance(data))
-        systematic = systematic + more
+        moved = moved + difference_of_models(poles_rad_s, *plan.richer.with_covariance(data))
     half_width = in_any_direction(np.abs(poles_rad_s.real), poles_rad_s)
-    known = np.isfinite(systematic).all(axis=(-2, -1), keepdims=True)
-    return np.where(known, systematic, half_width)
+    known = np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
+    systematic[wrong] = np.where(known, moved, half_width)
+    return systematic
 
 
 def _fewest_lines(data: BinData) -> int:
@@ -167,52 +156,3 @@ def difference_of_models(
     other = np.take_along_axis(richer_rad_s, nearest, axis=-1)
     moved = difference_of_halves(poles_rad_s, other)
     return np.asarray(moved + np.take_along_axis(covariance, nearest[..., None, None], axis=-3))
-
-
-def poles_and_covariance(
-    model: RationalModel, inverse: FloatArray, cost: FloatArray, dof: float
-) -> tuple[ComplexArray, FloatArray, BoolArray]:
-    """Poles of a fit, in the band or not, and their covariance as its residuals show it.
-
-    Parameters
-    ----------
-    model : RationalModel
-    inverse : (points, n, n) float
-        Of the normal matrix.
-    cost : (points,) float
-    dof : float
-        Complex degrees of freedom of the residuals.
-
-    Returns
-    -------
-    poles : (points, places) complex
-    covariance : (points, places, 2, 2) float
-        Of (f0_hz, damping_ratio); NaN where the data do not determine the mode.
-    lost : (points,) bool
-        Where a mode is none, or noise makes it and it is not beside another one.
-    """
-    covariance = inverse * (cost / (2 * max(dof, 1)))[:, None, None]
-    quantities, _ = pole_quantities(model, (0.0, np.inf), covariance)
-    poles = quantities["poles_rad_s"]
-    lines = np.full(cost.size, max(int(dof), 1))
-    found, distance = significant_modes(model, quantities, covariance, lines)
-    in_f0 = quantities["covariance"]
-    in_f0[~((np.linalg.det(in_f0) > 0) & (in_f0[..., 0, 0] > 0))] = np.nan  # lost to rounding
-    more = second_order(poles, np.isfinite(poles), distance)
-    lost = np.asarray((~found & ~beside_others(poles, found)).any(axis=-1))
-    return poles, in_f0 + more, lost
-
-
-def richer(structure: ModelStructure) -> ModelStructure:
-    """One mode more, as many residual terms."""
-    return replace(
-        structure, order=structure.order + 2, numerator_order=structure.numerator_order + 2
-    )
-
-
-def poorer(structure: ModelStructure) -> ModelStructure | None:
-    """One mode less, as many residual terms; None where the model has none to spare."""
-    order, numerator_order = structure.order - 2, structure.numerator_order - 2
-    if order < 1 or numerator_order < 0:
-        return None
-    return replace(structure, order=order, numerator_order=numerator_order)

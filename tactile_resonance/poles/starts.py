@@ -17,7 +17,6 @@ noise explains (`significance.fall_of_noise`).
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,9 +32,8 @@ from tactile_resonance.poles.fit import (
     minimise,
 )
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
-from tactile_resonance.poles.model import RationalModel
+from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.significance import fall_of_noise
-from tactile_resonance.poles.tables import Problem
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.lines_fit import LinesPlan
@@ -59,49 +57,39 @@ TRIED_AT_ONCE = 128
 SAME = 0.5
 
 
-def best_of_split(
-    problem: Problem,
-    data: BinData,
-    model: RationalModel,
-    solution: Solution,
-) -> Solution:
+def best_of_split(plan: FitPlan, data: BinData, solution: Solution) -> Solution:
     """The solution, or that from a start with its highest peak split if that costs less by more than noise.
 
     Parameters
     ----------
-    problem : Problem
+    plan : FitPlan
     data : BinData
-    model : RationalModel
-        Of the solution, one a point.
     solution : Solution
         Of a denominator of order 4 or more.
     """
-    start, there = _split_starts(problem, data, model)
+    start, there = _split_starts(plan, data, solution.theta)
     rows = np.flatnonzero(there)
     if not rows.size:
         return solution
-    again = minimise(problem, data.rows(rows), start[rows])
-    dof = data.records * (data.undriven + data.driven) - sum(problem.sizes) / 2
+    again = minimise(plan.problem, data.rows(rows), start[rows])
+    dof = data.records * data.order.size - sum(plan.problem.sizes) / 2
     fall = LEAST_FALL / max(dof, LEAST_FALL)
     better = again.converged & (
         ~solution.converged[rows] | (again.cost < solution.cost[rows] * (1 - fall))
     )
-    rows = rows[better]
-    kept = replace(again.rows(better), noise=solution.noise[rows], plain=solution.plain[rows])
-    solution.put(rows, kept)
+    solution.put(rows[better], again.rows(better))
     return solution
 
 
 @np.errstate(all="ignore")
 def _split_starts(
-    problem: Problem, data: BinData, model: RationalModel
+    plan: FitPlan, data: BinData, theta: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """(points, M, n) coefficients, and for which points there are such."""
-    a, b, own = problem.sizes
-    shared, records = a + b, data.records
-    poles = model.poles_rad_s()  # (points, a)
-    start = np.full((len(poles), records, shared + own), np.nan)
-    for k, of_point in enumerate(poles):
+    """Coefficients like theta (points, M, n), and for which points there are such."""
+    shared, records = sum(plan.problem.sizes[:2]), data.records
+    model = plan.model_of(theta[:, 0])
+    start = np.full(theta.shape, np.nan)
+    for k, of_point in enumerate(model.poles_rad_s()):  # (a,)
         above = of_point[of_point.imag > 0]
         if above.size < 2:
             continue
@@ -113,37 +101,19 @@ def _split_starts(
         kept = [p for p in of_point if p.imag <= 0 or p not in (highest, least)]
         kept = [p for p in kept if np.conj(p) not in (highest, least)]
         pair = np.array([highest + step, highest - step])
-        roots = model.variable.of_s(np.concatenate([kept, pair, pair.conj()]))
-        if roots.size != a:
+        poles = np.concatenate([kept, pair, pair.conj()])
+        if poles.size != of_point.size:
             continue
-        hessenberg = model.denominator_basis.hessenberg
-        theta = coefficients_of_roots(problem, data.rows(slice(k, k + 1)), hessenberg, roots)
-        start[k, :, :shared], start[k, :, shared:] = theta[:shared], theta[shared:].reshape(records, own)
+        found = _coefficients(plan, data.rows(slice(k, k + 1)), poles)
+        start[k, :, :shared], start[k, :, shared:] = found[:shared], found[shared:].reshape(records, -1)
     return start, np.isfinite(start).all(axis=(1, 2))
 
 
-def coefficients_of_roots(
-    problem: Problem, data: BinData, hessenberg: FloatArray, roots: ComplexArray
-) -> FloatArray:
-    """Coefficients with given roots of A, and the B and C that fit best.
-
-    Parameters
-    ----------
-    problem : Problem
-    data : BinData
-        Of one point.
-    hessenberg : (a + 1, a) float
-        Of the basis of A.
-    roots : (a,) complex
-        In the variable of the polynomials.
-
-    Returns
-    -------
-    (a + b + M c,) float
-        [A without its last, B, C of each record].
-    """
-    a, b, own = problem.sizes
-    basis = problem.denominator
+def _coefficients(plan: FitPlan, data: BinData, poles: ComplexArray) -> FloatArray:
+    """(a + b + M c,) of A with given poles (a,) [rad/s], and of the B and C that fit one point best."""
+    roots, hessenberg = plan.variable.of_s(poles), plan.denominator_basis.hessenberg
+    a, b, own = plan.problem.sizes
+    basis = plan.problem.denominator
     x = hessenberg[0, 0] + hessenberg[1, 0] * basis[:, 1]  # (K,) of the bins: x p_0 of the basis
     logarithm = np.sum(np.log(x[:, None] - roots), axis=-1)  # many factors over decades overflow
     phase = np.exp(1j * logarithm.imag)  # A / |A|
@@ -151,7 +121,7 @@ def coefficients_of_roots(
     denominator = _real_solution(weighted, phase)
     theta = np.zeros(a + b + data.records * own)
     theta[:a] = denominator[:-1] / denominator[-1]
-    linear = Linearised.of(problem, data, theta)
+    linear = Linearised.of(plan.problem, data, theta)
     used = np.isfinite(linear.variance)
     weight = np.tile(1 / np.sqrt(linear.variance[used]), data.records)
     theta[a:] = _real_solution(
@@ -221,7 +191,7 @@ def moved_to(
 
 
 @np.errstate(all="ignore")
-def dispensable(plan: LinesPlan, row: BinData, found: DenseSolution) -> ComplexArray:
+def dispensable(plan: LinesPlan, row: BinData, theta: FloatArray, cost: float) -> ComplexArray:
     """(N,) poles above the real axis [rad/s] of modes across others that take their place in a new fit.
 
     Parameters
@@ -229,15 +199,16 @@ def dispensable(plan: LinesPlan, row: BinData, found: DenseSolution) -> ComplexA
     plan : LinesPlan
     row : BinData
         Of one point.
-    found : DenseSolution
+    theta : (n,) float
         Its fit.
+    cost : float
     """
-    poles, less = _poles(plan, found), plan.poorer
+    poles, less = plan.model_of(theta[None]).poles_rad_s()[0], plan.poorer
     above = poles[poles.imag > 0]
     if less is None:
         return np.empty(0, complex)
     lines = int(np.isfinite(_variance(plan, row)).sum())
-    limit = fall_of_noise(lines) * found.cost / (lines - found.theta.size / 2)
+    limit = fall_of_noise(lines) * cost / (lines - theta.size / 2)
     out = []
     for k, pole in enumerate(above):
         apart = np.abs(np.delete(above, k).imag - pole.imag)
@@ -249,18 +220,13 @@ def dispensable(plan: LinesPlan, row: BinData, found: DenseSolution) -> ComplexA
         there, fit = exchanged(without[0], row, without[1])
         # one of the others that noise made may have become this one, which is needed then
         again = np.abs(_poles(there, fit) - pole) < SAME * abs(pole.real)
-        if fit.cost < found.cost + limit and not again.any():
+        if fit.cost < cost + limit and not again.any():
             out.append(pole)
     return np.array(out, complex)
 
 
 def _poles(plan: LinesPlan, solution: DenseSolution) -> ComplexArray:
     return plan.model_of(solution.theta[None]).poles_rad_s()[0]
-
-
-def _coefficients(plan: LinesPlan, row: BinData, poles: ComplexArray) -> FloatArray:
-    roots = plan.variable.of_s(poles)
-    return coefficients_of_roots(plan.problem, row, plan.denominator_basis.hessenberg, roots)
 
 
 def _minimum_from(
