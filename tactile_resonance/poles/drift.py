@@ -223,7 +223,7 @@ def _linearised(
     others = plan.other_bins.size
     data = BinData.of(y[None, None], u[None, None], plan.order, others)
     if not flat:
-        data, _ = with_noise(plan, data, theta[None, None])
+        data, *_ = with_noise(plan, data, theta[None, None])
     at = Linearised.of(plan.problem, data, theta)
     if flat:
         error = at.error[:, :others]

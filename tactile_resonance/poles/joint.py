@@ -31,7 +31,6 @@ from tactile_resonance.poles.basis import (
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint_fit import fit_records
-from tactile_resonance.poles.joint_noise import NoiseBands
 from tactile_resonance.poles.judgement import assemble
 from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.model import Variable
@@ -280,16 +279,6 @@ class JointPlan(FitPlan):
             return replace(self, structure=structure, transient_terms=None)
         except ValueError:
             return None
-
-    def noise_bands(self, records: int) -> NoiseBands:
-        """Pieces of the band, for so many records of a point."""
-        if records not in self._noise_bands:
-            self._noise_bands[records] = NoiseBands.of(self.other_bins, self.excited_bins, records)
-        return self._noise_bands[records]
-
-    @cached_property
-    def _noise_bands(self) -> dict[int, NoiseBands]:
-        return {}
 
     @property
     def resolution_hz(self) -> float:

@@ -17,13 +17,13 @@ import numpy as np
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Solution, minimise, refit_failed
-from tactile_resonance.poles.joint_noise import TINY, with_noise
+from tactile_resonance.poles.joint_noise import TINY, rules_between, with_noise
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import asks, lacking_terms
-from tactile_resonance.poles.levels import Level, Levels, Pieces, smooth_variance
+from tactile_resonance.poles.levels import Level, Levels, line_pieces, smooth_variance
 from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.model_error import systematic_of
-from tactile_resonance.poles.noise_level import are_flat
+from tactile_resonance.poles.noise_level import Pieces, are_flat
 from tactile_resonance.poles.realisations_spread import Spread
 from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.whiteness import are_smooth
@@ -88,8 +88,8 @@ class _Round:
     @classmethod
     def weighted_with_noise(cls, plan: JointPlan, plain: BinData, theta: FloatArray) -> _Round:
         """Weighted with the noise between harmonics that coefficients near the minimum show."""
-        data, found = with_noise(plan, plain, theta)
-        return cls.of(plan, plain, data, theta, found.mean_variances, found.kind)
+        data, noise, kind = with_noise(plan, plain, theta)
+        return cls.of(plan, plain, data, theta, noise, kind)
 
     def rows(self, which: IntArray) -> _Round:
         """Some of the points, of a round without `share`."""
@@ -117,7 +117,7 @@ class _Round:
     @cached_property
     def pieces(self) -> Pieces:
         """Of the excited lines, of M >= 2 realisations."""
-        return Pieces.of(self.data.driven, self.data.records - 1)
+        return line_pieces(self.data.driven, self.data.records - 1)
 
     @cached_property
     def levels(self) -> Levels:
@@ -199,7 +199,8 @@ def _fit(
         solution = minimise(plan.problem, data)
         noise = np.tile([1.0, ratio], (len(y), 1))
     else:
-        solution = minimise(plan.problem, plain, None, plan.noise_bands(plain.records).rules)
+        rules = rules_between(plain.undriven, plain.records)
+        solution = minimise(plan.problem, plain, None, rules)
         noise = solution.noise
         variance_y = np.where(noise[:, :1] > TINY, noise[:, :1], 1.0)
         data = plain.weighted(rest=variance_y, variance_y=variance_y, variance_u=noise[:, 1:])
@@ -321,8 +322,7 @@ def _from_scatter(fitted: _Round) -> _Round:
     total, kind = smooth_variance(levels.line_variance * fitted.variance, gain, fitted.pieces)
     if fitted.data.undriven:
         # of distorted lines with too large weights the transients were wrong, and so the noise
-        data, found = with_noise(plan, fitted.plain, theta)
-        noise = found.mean_variances
+        data, noise, _ = with_noise(plan, fitted.plain, theta)
         known = np.broadcast_to(data.residual_variance(g), g.shape)
         data = data.weighted(variance_y=data.variance_y + np.maximum(total - known, 0))
         share = known / np.maximum(total, known)
@@ -342,7 +342,7 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     plan, solution, levels = fitted.plan, fitted.solution, fitted.levels
     batch, records, _ = solution.theta.shape
     a, b, own = plan.problem.sizes
-    common = levels.scatter.common / np.sqrt(levels.excited)[:, None]
+    common = levels.common / np.sqrt(levels.excited)[:, None]
     suspect = are_smooth(common, plan.structure.parameters)
     if suspect.any():
         suspect &= fitted.more_than_rounding(levels.excited)

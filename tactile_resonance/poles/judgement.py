@@ -181,9 +181,11 @@ def assemble(
         significant &= ~_sum_of_hidden(poles, significant)
     certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
     significant |= _needed(plan, judged, poles, significant, certain, costs)
-    remark = _without_lost_totals(quantities["total_covariance"], significant, judged.remark)
+    remark, notes = judged.remark.copy(), [_without_lost_totals(quantities, significant)]
     if poles.shape[-1] > 1:
-        remark = _widen(quantities, second_order(poles, significant, distance), remark)
+        notes.append(_widen(quantities, second_order(poles, significant, distance)))
+    for k, note in (item for of_points in notes for item in of_points.items()):
+        remark[k] = "; ".join(filter(None, [remark[k], note]))
     code = np.full(hopeless.shape, STATUS_CODE[PolesStatus.OK], np.uint8)
     with np.errstate(invalid="ignore"):
         # the gravest last, so that it stays
@@ -263,41 +265,27 @@ def _needed(
     return beside
 
 
-def _without_lost_totals(
-    total: FloatArray, significant: BoolArray, remark: npt.NDArray[np.object_]
-) -> npt.NDArray[np.object_]:
-    """Total covariances (batch, k, 2, 2) that rounding has made negative become NaN; the remark says so."""
+def _without_lost_totals(quantities: dict[str, npt.NDArray], significant: BoolArray) -> dict[int, str]:
+    """Total covariances (batch, k, 2, 2) that rounding has made negative become NaN; notes of points."""
+    total = quantities["total_covariance"]
     lost = (np.diagonal(total, axis1=-2, axis2=-1) <= 0).any(axis=-1)
-    if not lost.any():
-        return remark
     total[lost] = np.nan
-    rows = np.flatnonzero((lost & significant).any(axis=-1))
-    remark = remark.copy()
-    for k in rows:
-        note = "the total covariance is lost to rounding: a smaller order has one"
-        remark[k] = "; ".join(filter(None, [remark[k], note]))
-    return remark
+    note = "the total covariance is lost to rounding: a smaller order has one"
+    return dict.fromkeys(np.flatnonzero((lost & significant).any(axis=-1)).tolist(), note)
 
 
-def _widen(
-    quantities: dict[str, npt.NDArray], more: FloatArray, remark: npt.NDArray[np.object_]
-) -> npt.NDArray[np.object_]:
-    """Add more (batch, k, 2, 2) to the total covariance; the remark says of which points."""
-    wide = more[..., 0, 0] > 0
-    rows = np.flatnonzero(wide.any(axis=-1))
-    if rows.size == 0:
-        return remark
+def _widen(quantities: dict[str, npt.NDArray], more: FloatArray) -> dict[int, str]:
+    """Add more (batch, k, 2, 2) to the total covariance; notes of the points where it is."""
+    wide, notes = more[..., 0, 0] > 0, dict[int, str]()
     total, covariance = quantities["total_covariance"], quantities["covariance"]
     total[wide] = np.where(np.isfinite(total), total, covariance)[wide] + more[wide]
-    remark = remark.copy()
-    for k in rows:
+    for k in np.flatnonzero(wide.any(axis=-1)).tolist():
         f0_hz = " and ".join(f"{f0:.4g}" for f0 in quantities["f0_hz"][k][wide[k]])
-        note = (
+        notes[k] = (
             f"the modes at {f0_hz} Hz are nearer than their widths, and how they share the response is "
             "uncertain: rely on the total covariance"
         )
-        remark[k] = "; ".join(filter(None, [remark[k], note]))
-    return remark
+    return notes
 
 
 def _sum_of_hidden(poles: ComplexArray, significant: BoolArray) -> BoolArray:

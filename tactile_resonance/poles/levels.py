@@ -21,6 +21,7 @@ from tactile_resonance.poles.joint_noise import BINS_PER_BAND
 from tactile_resonance.poles.likelihood import invert
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.noise_level import (
+    Pieces,
     is_rare,
     log_linear,
     model_variance,
@@ -112,82 +113,38 @@ class Level:
         return cls(scale, cost, expected, suspect, noise * level[:, None], correction)
 
 
-@dataclass(frozen=True, eq=False)
-class Scatter:
-    """Weighted residuals of M realisations apart.
+def common_and_differing(
+    residual: ComplexArray, u: ComplexArray
+) -> tuple[ComplexArray, FloatArray]:
+    """What weighted residuals of M realisations have in common, and the power of what they differ by.
 
-    Attributes
+    Parameters
     ----------
+    residual : (batch, M, K) complex
+        Turned by the phases of the inputs.
+    u : (batch, M, K) complex
+        Inputs.
+
+    Returns
+    -------
     common : (batch, K) complex
-        Turned by the phase of the input; of the variance of one residual. 0 on lines without input.
-    differing : (batch, M, K) complex
-        The rest, turned too; M - 1 degrees of freedom a line.
+        Of the variance of one residual. 0 on lines without input.
+    differing : (batch, K) float
+        With M - 1 degrees of freedom a line.
     """
-
-    common: ComplexArray
-    differing: ComplexArray
-
-    @classmethod
-    def of(cls, residual: ComplexArray, u: ComplexArray) -> Scatter:
-        """Of weighted residuals (batch, M, K), turned by the phases of inputs (batch, M, K)."""
-        size = np.abs(u)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            whole = np.sqrt(np.sum(size**2, axis=1, keepdims=True))
-            direction = np.where(whole > 0, size / whole, 0.0)
-        common = np.einsum("bmk,bmk->bk", direction, residual)
-        return cls(common, residual - direction * common[:, None])
-
-    @property
-    def common_cost(self) -> FloatArray:
-        """(batch,)."""
-        return np.asarray(np.sum(self.common.real**2 + self.common.imag**2, axis=-1))
-
-    @property
-    def line_cost(self) -> FloatArray:
-        """(batch, K) of what differs."""
-        return np.asarray(np.sum(self.differing.real**2 + self.differing.imag**2, axis=1))
-
-    @property
-    def differing_cost(self) -> FloatArray:
-        """(batch,)."""
-        return np.asarray(self.line_cost.sum(axis=-1))
+    size = np.abs(u)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        whole = np.sqrt(np.sum(size**2, axis=1, keepdims=True))
+        direction = np.where(whole > 0, size / whole, 0.0)
+    common = np.einsum("bmk,bmk->bk", direction, residual)
+    differing = residual - direction * common[:, None]
+    return common, np.sum(differing.real**2 + differing.imag**2, axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Pieces:
-    """Neighbouring lines whose variances are averaged before they are compared with each other.
-
-    Attributes
-    ----------
-    lines : int
-        In each, the last one longer.
-    starts, counts : (pieces,) int
-    of_line : (K,) int
-    dof : int
-        Complex degrees of freedom of the variance of a piece.
-    """
-
-    lines: int
-    starts: IntArray
-    counts: IntArray
-    of_line: IntArray
-    dof: int
-
-    @classmethod
-    def of(cls, lines: int, dof: int) -> Pieces:
-        """Of lines with a sample variance of `dof` degrees of freedom each."""
-        size = min(-(-PIECE_DOF // dof), max(1, lines // WANTED_PIECES))
-        size = max(size, -(-FEWEST_PIECE_DOF // dof))
-        pieces = max(1, lines // size)
-        starts = np.arange(pieces) * size
-        counts = np.diff(np.append(starts, lines))
-        return cls(
-            size, starts, counts, np.minimum(np.arange(lines) // size, pieces - 1), size * dof
-        )
-
-    def means(self, values: FloatArray) -> FloatArray:
-        """(batch, pieces) of (batch, K)."""
-        return np.asarray(np.add.reduceat(values, self.starts, axis=-1) / self.counts)
+def line_pieces(lines: int, dof: int) -> Pieces:
+    """Pieces of lines with a sample variance of `dof` degrees of freedom each."""
+    size = min(-(-PIECE_DOF // dof), max(1, lines // WANTED_PIECES))
+    return Pieces.of(lines, max(size, -(-FEWEST_PIECE_DOF // dof)), dof)
 
 
 def smooth_variance(
@@ -212,7 +169,7 @@ def smooth_variance(
         more = two_channels(sample[sloped] / curve, gain[sloped])
         variance[sloped] = curve * more
     if each.any():
-        variance[each] = pieces.means(sample[each])[:, pieces.of_line]
+        variance[each] = pieces.means(sample[each])[:, pieces.of_bin]
     return variance, kind
 
 
@@ -222,7 +179,8 @@ class Levels:
 
     Attributes
     ----------
-    scatter : Scatter
+    common : (batch, K_e) complex
+        Of weighted residuals; see `common_and_differing`.
     solution : Solution
     shared : int
         Coefficients that realisations share.
@@ -250,7 +208,7 @@ class Levels:
     information too: ``nu / (nu - 2)``, see `noise_level.VarianceModel.information_correction`.
     """
 
-    scatter: Scatter
+    common: ComplexArray
     solution: Solution
     shared: int
     between: FloatArray
@@ -291,30 +249,31 @@ class Levels:
         a, b, _ = plan.problem.sizes
         shared = a + b
         batch, records, lines = solution.residual.shape
-        scatter = Scatter.of(solution.residual, u)
+        common, differing = common_and_differing(solution.residual, u)
+        common_cost = np.sum(common.real**2 + common.imag**2, axis=-1)
         used_between, used = solution.leverage.T
         # what the transients take from a line: of each a part 1/M of what all have in common
         taken = _taken_by_transients(plan, solution, variance)
         line_dof = (records - 1) * np.maximum(1 - taken / (2 * records), 0.05)
         excited_dof = np.maximum(line_dof.sum(axis=-1), 0.5)
         common_dof = np.maximum(records * lines - used / 2 - excited_dof, 0.5)
-        excited = scatter.differing_cost / excited_dof
+        excited = differing.sum(axis=-1) / excited_dof
         between = between_dof = np.full(batch, np.nan)
         if plan.others_at.size > 0:
             between_dof = records * plan.others_at.size - used_between / 2
             between = solution.part_cost[:, 0] / between_dof
-        cost = scatter.common_cost / excited
+        cost = common_cost / excited
         nu = np.where(by_piece, float(pieces.dof), excited_dof)
         expected = common_dof * np.where(nu > 1, nu / (nu - 1), np.nan)
         ratio = cost / common_dof
         chance = special.fdtrc(2 * common_dof, 2 * excited_dof, ratio)
         if by_piece.any():
             # sums over pieces of F(2 lines, 2 nu): as a chi-square of the same mean and variance
-            spread = (pieces.lines + nu - 1) / (lines * (nu - 2))
+            spread = (pieces.size + nu - 1) / (lines * (nu - 2))
             of_pieces = special.chdtrc(2 / spread, 2 / spread * cost / expected)
             chance = np.where(by_piece, of_pieces, chance)
         return cls(
-            scatter,
+            common,
             solution,
             shared,
             between,
@@ -325,7 +284,7 @@ class Levels:
             cost,
             expected,
             chance < MODEL_ERROR_PROBABILITY,
-            scatter.line_cost / line_dof,
+            differing / line_dof,
             np.where(by_piece, float(pieces.dof), 0.0),
         )
 
@@ -341,7 +300,8 @@ class Levels:
         """
         alone = suspect | (self.piece_dof > 0)
         dof = self.excited_dof + np.where(alone, 0.0, self.common_dof)
-        cost = self.excited * self.excited_dof + np.where(alone, 0.0, self.scatter.common_cost)
+        common_cost = np.sum(self.common.real**2 + self.common.imag**2, axis=-1)
+        cost = self.excited * self.excited_dof + np.where(alone, 0.0, common_cost)
         return cost / dof, dof
 
     def noise_level(self, suspect: BoolArray) -> FloatArray:

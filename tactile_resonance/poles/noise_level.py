@@ -27,6 +27,42 @@ KINDS = ("flat", "sloped", "per line")
 
 
 @dataclass(frozen=True, eq=False)
+class Pieces:
+    """Neighbouring bins, or lines, whose variances are averaged before they are compared with each other.
+
+    Attributes
+    ----------
+    size : int
+        Bins in each, the last one longer.
+    starts, counts : (pieces,) int
+        First value of each, and how many there are.
+    of_bin : (K,) int
+        Which piece a bin belongs to.
+    dof : int
+        Complex degrees of freedom of the variance of a piece.
+    """
+
+    size: int
+    starts: IntArray
+    counts: IntArray
+    of_bin: IntArray
+    dof: int
+
+    @classmethod
+    @lru_cache(maxsize=64)
+    def of(cls, bins: int, size: int, dof: int, values: int = 1) -> Pieces:
+        """Of bins with a sample variance of `dof` degrees of freedom each, from so many values."""
+        pieces = max(1, bins // size)
+        starts = np.arange(pieces) * (size * values)
+        counts = np.diff(np.append(starts, bins * values))
+        return cls(size, starts, counts, np.minimum(np.arange(bins) // size, pieces - 1), size * dof)
+
+    def means(self, values: FloatArray) -> FloatArray:
+        """(batch, pieces) of (batch, K values)."""
+        return np.asarray(np.add.reduceat(values, self.starts, axis=-1) / self.counts)
+
+
+@dataclass(frozen=True, eq=False)
 class VarianceModel:
     """Variance to weight with, for a batch of points.
 
