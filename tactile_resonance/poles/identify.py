@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.poles.inputs import checked_band, checked_frf, checked_spectra
 from tactile_resonance.poles.judgement import Judged, assemble
@@ -238,10 +238,10 @@ def _judged(
     if not level_known.all():
         # the residuals are all there is: they hold noise, distortion and model error together
         level = fit.cost / np.maximum(used - parameters / 2, 0.5)
-        unknown = np.full_like(covariance, np.nan)
-        covariance = _where(level_known, covariance, unknown)
+        known_here, unknown = level_known[:, None, None], np.full_like(covariance, np.nan)
+        covariance = np.where(known_here, covariance, unknown)
         from_residuals = plain * level[:, None, None]
-        total = _where(level_known, unknown if total is None else total, from_residuals)
+        total = np.where(known_here, unknown if total is None else total, from_residuals)
         # what rounding leaves of exact data says nothing
         suspect &= level_known | (level > ROUNDED)
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
@@ -250,11 +250,11 @@ def _judged(
         plan,
         used,
         theta=fit.theta[:, 0],
-        condition=fit.condition,
+        condition_number=fit.condition,
         converged=fit.converged,
         residual=residual,
         cost=cost,
-        expected=expected,
+        expected_cost=expected,
         suspect=suspect,
         covariance=covariance,
         total=total,
@@ -275,18 +275,13 @@ def _nothing(plan: LinesPlan, used: IntArray) -> Judged:
         plan,
         np.minimum(used, plan.structure.fewest_lines - 1),
         theta=np.full((batch, parameters), np.nan),
-        condition=nan,
+        condition_number=nan,
         converged=no,
         residual=np.zeros((batch, 0), complex),
         cost=nan,
-        expected=nan,
+        expected_cost=nan,
         suspect=no,
         covariance=matrix,
         total=matrix,
         kind=np.full(batch, -1),
     )
-
-
-def _where(rows: BoolArray, those: FloatArray, others: FloatArray) -> FloatArray:
-    """(batch, n, n) matrices of some points, and of the others."""
-    return np.where(rows[:, None, None], those, others)

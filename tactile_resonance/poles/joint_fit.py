@@ -104,6 +104,15 @@ class _Round:
             self.kind[which],
         )
 
+    @property
+    def lines(self) -> IntArray:
+        """(batch,) excited lines; 0 of points of which a bin is not finite."""
+        usable = np.isfinite(self.solution.cost)
+        for k in np.flatnonzero(~usable):
+            y, u = self.plain.y[k], self.plain.u[k]
+            usable[k] = bool(np.isfinite(y).all() and np.isfinite(u).all())
+        return np.where(usable, self.plan.excited_at.size, 0)
+
     @cached_property
     def response(self) -> ComplexArray:
         """(batch, K_e) on excited lines."""
@@ -175,9 +184,9 @@ def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
         if not doubtful.any():
             break
         rows = np.flatnonzero(doubtful)
-        before = judged.noise[rows, 0]
+        before = judged.noise_variance[rows, 0]
         judged.put(rows, _fit(plan, u[rows], y[rows], judged.theta[rows, None]))
-        doubtful[rows] &= np.abs(judged.noise[rows, 0] - before) > SAME_LEVEL * before
+        doubtful[rows] &= np.abs(judged.noise_variance[rows, 0] - before) > SAME_LEVEL * before
     return judged
 
 
@@ -217,14 +226,6 @@ def _fit(
     return judged
 
 
-def _usable(data: BinData, cost: FloatArray) -> BoolArray:
-    """(batch,) points whose bins are all finite."""
-    usable = np.isfinite(cost)
-    for k in np.flatnonzero(~usable):
-        usable[k] = bool(np.isfinite(data.y[k]).all() and np.isfinite(data.u[k]).all())
-    return usable
-
-
 def _may_return(fit: Judged | Solution) -> BoolArray:
     """(batch,) whether a fit ended where another one may begin."""
     finite = np.isfinite(fit.theta).all(axis=tuple(range(1, fit.theta.ndim)))
@@ -261,19 +262,19 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     known = plan.level_known
     return Judged.of(
         plan,
-        np.where(_usable(fitted.plain, solution.cost), plan.excited_at.size, 0),
+        fitted.lines,
         theta=theta,
-        condition=solution.condition,
+        condition_number=solution.condition,
         converged=solution.converged,
         residual=residual,
         cost=level.cost,
-        expected=level.expected,
+        expected_cost=level.expected,
         suspect=suspect,
         covariance=covariance if known else np.full_like(covariance, np.nan),
         total=None if known else covariance,
         kind=fitted.kind,
         level_known=np.full(batch, known),
-        noise=level.noise,
+        noise_variance=level.noise,
         systematic=systematic_of(plan, data, solution.theta, wrong),
         lacking=lacking,
     )
@@ -351,20 +352,20 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     theta = solution.theta
     judged = Judged.of(
         plan,
-        np.where(_usable(fitted.plain, solution.cost), plan.excited_at.size, 0),
+        fitted.lines,
         theta=np.concatenate(
             [theta[:, 0, : a + b], theta[..., a + b :].reshape(batch, records * own)], axis=1
         ),
-        condition=solution.condition,
+        condition_number=solution.condition,
         converged=solution.converged,
         residual=common,
         cost=levels.cost,
-        expected=levels.expected,
+        expected_cost=levels.expected,
         suspect=suspect,
         covariance=covariance,
         total=total,
         kind=fitted.kind,
-        noise=fitted.noise * levels.noise_level(suspect)[:, None],
+        noise_variance=fitted.noise * levels.noise_level(suspect)[:, None],
         systematic=systematic_of(plan, fitted.data, theta, suspect),
     )
     return _each_by_itself(judged, total, first)

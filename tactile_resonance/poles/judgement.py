@@ -29,6 +29,11 @@ Plan = TypeVar("Plan", bound=FitPlan)
 LARGEST_CONDITION_NUMBER = 1e12
 # Of `Judged.kind`.
 NAMES = np.array([*KINDS, "unknown", ""])
+# Fields that a `PolesBatch` takes as they are.
+AS_JUDGED = (
+    *("lines", "condition_number", "residual", "cost"),
+    *("expected_cost", "noise_variance", "lacking"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +46,11 @@ class Judged:
         Coefficients [A without its last, B, C]; of several records the C of each.
     lines : (batch,) int
         That were used; 0 where a bin of a record is not finite.
-    condition : (batch,) float
+    condition_number : (batch,) float
     converged : (batch,) bool
     residual : (batch, F) complex
         Weighted, on the (excited) lines; 0 on those left out.
-    cost, expected : (batch,) float
+    cost, expected_cost : (batch,) float
         Of these lines; NaN where the level is from the residuals themselves.
     suspect : (batch,) bool
         Whether cost, smoothness of the residuals or what the model lacks contradict the model.
@@ -58,7 +63,7 @@ class Judged:
         Index into `NAMES`, what the variance was taken for.
     level_known : (batch,) bool
         Whether the variance is known otherwise than from the residuals.
-    noise : (batch, 2) float
+    noise_variance : (batch, 2) float
         Variance of a bin of Y and of U; NaN where the data brought their own.
     systematic : (batch, places, 2, 2) float
         What a model error moves (f0_hz, damping_ratio) by, as an outer product, and what else adds to the
@@ -73,17 +78,17 @@ class Judged:
 
     theta: FloatArray
     lines: IntArray
-    condition: FloatArray
+    condition_number: FloatArray
     converged: BoolArray
     residual: ComplexArray
     cost: FloatArray
-    expected: FloatArray
+    expected_cost: FloatArray
     suspect: BoolArray
     covariance: FloatArray
     total: FloatArray | None
     kind: IntArray
     level_known: BoolArray
-    noise: FloatArray
+    noise_variance: FloatArray
     systematic: FloatArray
     lacking: FloatArray
     dispensable: BoolArray
@@ -95,7 +100,7 @@ class Judged:
         batch, places = lines.size, plan.structure.order // 2
         nothing = {
             "level_known": np.ones(batch, bool),
-            "noise": np.full((batch, 2), np.nan),
+            "noise_variance": np.full((batch, 2), np.nan),
             "systematic": np.zeros((batch, places, 2, 2)),
             "lacking": np.full((batch, 3), np.nan),
             "dispensable": np.zeros((batch, places), bool),
@@ -121,7 +126,7 @@ class Judged:
                 total = np.where(known, total, self.covariance)
         if self.suspect.any():
             wrong = self.suspect[rows]
-            args = (self.residual[rows][wrong], self.cost[rows][wrong], self.expected[rows][wrong])
+            args = (self.residual[rows][wrong], self.cost[rows][wrong], self.expected_cost[rows][wrong])
             total = total.copy()
             total[wrong] *= model_error_factor(*args)[:, None, None]
         return rows, total
@@ -149,7 +154,7 @@ def assemble(
     """
     structure, band_hz, model = plan.structure, plan.band_hz, plan.model_of(judged.theta)
     enough = judged.lines >= structure.fewest_lines
-    conditioned = judged.condition < LARGEST_CONDITION_NUMBER
+    conditioned = judged.condition_number < LARGEST_CONDITION_NUMBER
     # a model that the lines do not determine has no poles worth a number
     undetermined = ~(enough & conditioned)
     hopeless = undetermined | ~judged.converged
@@ -208,15 +213,9 @@ def assemble(
     return PolesBatch(
         **{name: batch(values) for name, values in quantities.items()},
         coefficient_covariance=batch(covariance),
-        cost=batch(judged.cost),
-        expected_cost=batch(judged.expected),
-        condition_number=batch(judged.condition),
-        residual=batch(judged.residual),
-        lines=batch(judged.lines),
+        **{name: batch(getattr(judged, name)) for name in AS_JUDGED},
         significant=batch(significant),
         status_code=batch(code),
-        noise_variance=batch(judged.noise),
-        lacking=batch(judged.lacking),
         fit=replace(
             model,
             denominator=batch(model.denominator),
@@ -258,7 +257,7 @@ def _needed(
     beside = beside_others(poles, found) & ~judged.dispensable & asked[:, None] & (less is not None)
     rows = np.flatnonzero(beside.any(axis=-1))
     if less is not None and rows.size:
-        lines, expected = judged.lines[rows], judged.expected[rows]
+        lines, expected = judged.lines[rows], judged.expected_cost[rows]
         level = np.maximum(expected / (lines - plan.structure.parameters / 2), 1)
         fall = costs(less, rows) - judged.cost[rows]
         beside[rows] &= (fall > level * fall_of_noise(lines))[:, None]

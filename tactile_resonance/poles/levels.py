@@ -25,6 +25,7 @@ from tactile_resonance.poles.noise_level import (
     is_rare,
     log_linear,
     model_variance,
+    moments_of_ratio,
     student_variance,
     two_channels,
 )
@@ -102,9 +103,7 @@ class Level:
         suspect = is_rare(cost / dof_e, dof_e, dof_o, MODEL_ERROR_PROBABILITY)
         correction = student_variance(dof)
         if by_piece.any():
-            # weights from few bins: moments of F(2, 2 nu), as in `noise_level.VarianceModel`
-            mean = BINS_PER_BAND / (BINS_PER_BAND - 1)
-            std = mean * np.sqrt(BINS_PER_BAND / (BINS_PER_BAND - 2))
+            mean, std = moments_of_ratio(BINS_PER_BAND)  # weights are from few bins
             limit = dof_e * mean - np.sqrt(dof_e) * std * special.ndtri(MODEL_ERROR_PROBABILITY)
             expected = np.where(by_piece, expected * mean, expected)
             suspect = np.where(by_piece, cost > limit, suspect)

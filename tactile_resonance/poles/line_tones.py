@@ -70,16 +70,16 @@ def _most_striking(batch: PolesBatch, frf: FRF) -> int | None:
         return None
     x = fit.variable.of_frequency(frf.frequency_hz)
     p, q = (basis.at(x, 0)[0] for basis in (fit.denominator_basis, fit.numerator_basis))
-    jacobian = np.concatenate([-response[:, None] * p[:, :-1], q], axis=-1)
     smooth = median_filter(np.where(used, variance, np.median(variance[used])), ALIKE_LINES)
     by_line = str(batch.variance_model) == "per line"
     weight = used / np.sqrt(np.where(used, variance, 1.0) if by_line else smooth)
     delay = np.exp(-2j * np.pi * frf.frequency_hz * fit.delay_s)
-    jacobian *= (weight * delay / (p @ fit.denominator))[:, None]
-    error = np.asarray(np.where(used, frf.g - response, 0) * weight, complex)
+    scale = weight * delay / (p @ fit.denominator)
+    error = np.asarray(np.where(used, frf.g - response, 0) * weight, complex)[None]
+    bases = p, q, np.empty((used.size, 0), complex)
     none = np.zeros_like(used)
     least = ROUNDING * np.mean(np.abs(response[used]) ** 2) * weight**2
-    power = falls_without_each(jacobian[None], np.empty((used.size, 0), complex), error[None])[0]
+    power = falls_without_each(bases, response[None], np.ones_like(error), scale, error)[0]
     dof = frf.dof if by_line and frf.dof else np.inf
     chance = chances_of(power, [used, none, none], 1, np.where(used, least, 1.0), dof)
     line = int(np.argmin(chance))

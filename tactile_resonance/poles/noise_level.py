@@ -120,13 +120,16 @@ class VarianceModel:
         if by_line.any():
             rare[by_line] = False
             if self.dof > 2:
-                # moments of F(2, 2 nu)
-                nu = self.dof
-                mean = nu / (nu - 1)
-                std = mean * np.sqrt(nu / (nu - 2))
+                mean, std = moments_of_ratio(self.dof)
                 above = (cost - free * mean) / (np.sqrt(free) * std)
                 rare |= by_line & (above > -special.ndtri(probability))
         return rare
+
+
+def moments_of_ratio(dof: int) -> tuple[float, float]:
+    """Mean and deviation of F(2, 2 nu): of a power over a variance of so many complex degrees of freedom."""
+    mean = dof / (dof - 1)
+    return mean, mean * np.sqrt(dof / (dof - 2))
 
 
 def is_rare(

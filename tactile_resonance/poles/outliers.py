@@ -28,21 +28,32 @@ CERTAIN_LEVERAGE = 0.99
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def falls_without_each(shared: ComplexArray, own: ComplexArray, error: ComplexArray) -> FloatArray:
+def falls_without_each(
+    bases: tuple[ComplexArray, ComplexArray, ComplexArray],
+    output: ComplexArray,
+    u: ComplexArray,
+    scale: FloatArray | ComplexArray,
+    error: ComplexArray,
+) -> FloatArray:
     """(M, K) what the cost falls by without a bin, in units of its variance.
 
     0 where the fit goes through a bin whatever is there.
 
     Parameters
     ----------
-    shared : (M, K, n) complex
-        Derivative of the model by the n real parameters that all records share, weighted; 0 on bins not
-        used.
-    own : (K, c) complex
-        By those of one record, the same for each.
+    bases : (K, a + 1), (K, b), (K, c) complex
+        Of A, B and C.
+    output, u : (M, K) complex
+        Of the model, and its input.
+    scale : (K,) float or complex
+        What derivatives of the error are weighted with, over A; 0 on bins not used.
     error : (M, K) complex
         Weighted; E|error|^2 = 1 of noise.
     """
+    of_a, of_b, of_c = bases
+    shared = np.concatenate([-output[..., None] * of_a[:, :-1], u[..., None] * of_b], axis=-1)
+    shared = shared * scale[:, None]  # (M, K, n)
+    own = of_c * scale[:, None]
     records, bins, n = shared.shape
     of_own = np.linalg.qr(_real_rows(own))[0]  # (2 K, c)
     rest = _real_rows(shared)  # (M, 2 K, n)

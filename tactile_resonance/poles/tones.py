@@ -228,17 +228,9 @@ class _Model:
 
         0 where a bin is not used.
         """
-        used = self.excited | self.others
-        by_shared = np.concatenate(
-            [
-                -self._output[..., None] * self._p[:, :-1],
-                np.where(self.driven, self._u, 0)[..., None] * self._q,
-            ],
-            axis=-1,
-        )  # (M, K, a + b)
-        weight = used / np.sqrt(self.variance)
-        scale = (weight / self._a)[:, None]
-        falls = falls_without_each(by_shared * scale, self._t * scale, self.errors() * weight)
+        weight = (self.excited | self.others) / np.sqrt(self.variance)
+        u, bases = np.where(self.driven, self._u, 0), (self._p, self._q, self._t)
+        falls = falls_without_each(bases, self._output, u, weight / self._a, self.errors() * weight)
         return np.asarray(falls.mean(axis=0))
 
 
