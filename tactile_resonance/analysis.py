@@ -20,10 +20,9 @@ from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.poles.estimator import POLES_METHODS, second_attempt
+from tactile_resonance.poles.estimator import POLES_METHODS, choose_among, second_attempt
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
-from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
 from tactile_resonance.recording.recording import Recording

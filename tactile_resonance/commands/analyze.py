@@ -25,7 +25,7 @@ from tactile_resonance.fields import band, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
 from tactile_resonance.front import read_record, read_run
-from tactile_resonance.poles.order_choice import CANDIDATES
+from tactile_resonance.poles.estimator import CANDIDATES
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, ModelStructure
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.silent import silent_record

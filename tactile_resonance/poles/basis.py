@@ -99,8 +99,6 @@ class PolynomialBasis:
         m = coefficients.shape[-1] - 1
         last = self.hessenberg[m, m - 1] * coefficients[..., :m] / coefficients[..., m:]
         h = self.hessenberg[:m, :m]
-        if m == 1:
-            return (h[0, 0] - last).astype(complex)
         if m == 2:  # closed form: an eigenvalue solver costs more than the fit
             first, second = h[0, 0], h[1, 1] - last[..., 1]
             half = (first + second) / 2

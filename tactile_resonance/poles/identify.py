@@ -7,13 +7,19 @@ import numpy as np
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.poles.inputs import checked_band, checked_frf, checked_spectra
 from tactile_resonance.poles.judgement import Judged, assemble
-from tactile_resonance.poles.line_tones import poles_without_tones
-from tactile_resonance.poles.line_weights import WeightedLines, lines_of_frf, lines_of_spectra
+from tactile_resonance.poles.lines import (
+    WeightedLines,
+    checked_band,
+    checked_frf,
+    checked_spectra,
+    lines_of_frf,
+    lines_of_spectra,
+)
 from tactile_resonance.poles.lines_fit import LinesPlan
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, systematic_of
 from tactile_resonance.poles.noise_level import KINDS
+from tactile_resonance.poles.outliers import poles_without_tones
 from tactile_resonance.poles.result import Poles, PolesBatch
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure, checked_structure

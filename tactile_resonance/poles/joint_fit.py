@@ -95,13 +95,13 @@ class _Round:
         """Some of the points, of a round without `share`."""
         if which.size == self.kind.size:
             return self
-        return _Round(
-            self.plan,
-            self.plain.rows(which),
-            self.data.rows(which),
-            self.solution.rows(which),
-            self.noise[which],
-            self.kind[which],
+        return replace(
+            self,
+            plain=self.plain.rows(which),
+            data=self.data.rows(which),
+            solution=self.solution.rows(which),
+            noise=self.noise[which],
+            kind=self.kind[which],
         )
 
     @property

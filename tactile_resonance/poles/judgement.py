@@ -11,17 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.covariance import pole_quantities, propagated
 from tactile_resonance.poles.model_error import model_error_factor
-from tactile_resonance.poles.noise_level import KINDS
-from tactile_resonance.poles.plan import FitPlan
-from tactile_resonance.poles.result import STATUS_CODE, PolesBatch, PolesStatus
-from tactile_resonance.poles.significance import (
+from tactile_resonance.poles.modes import (
     beside_others,
     fall_of_noise,
+    pole_quantities,
+    propagated,
     second_order,
     significant_modes,
 )
+from tactile_resonance.poles.noise_level import KINDS
+from tactile_resonance.poles.plan import FitPlan
+from tactile_resonance.poles.result import STATUS_CODE, PolesBatch, PolesStatus
 
 Plan = TypeVar("Plan", bound=FitPlan)
 
@@ -251,7 +252,7 @@ def _needed(
     """(batch, k) modes beside others whose residue noise could make, but without which the fit is worse.
 
     Two modes nearer than their widths share what the lines say of them, so that the residue of one may be
-    uncertain, and only a fit without it tells; see `significance.fall_of_noise`.
+    uncertain, and only a fit without it tells; see `modes.fall_of_noise`.
     """
     less = plan.poorer
     beside = beside_others(poles, found) & ~judged.dispensable & asked[:, None] & (less is not None)

@@ -7,9 +7,9 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.modes import in_any_direction
 from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.result import natural_frequency_and_damping
-from tactile_resonance.poles.significance import in_any_direction
 
 # A cost that noise alone exceeds once in a thousand fits counts as model error.
 MODEL_ERROR_PROBABILITY = 1e-3

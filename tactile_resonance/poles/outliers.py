@@ -5,15 +5,24 @@ The test of an outlier of a regression: by how much the cost falls without it (C
 *Residuals and Influence in Regression* (1982), section 2.2). What it is compared with are medians of
 bins around of the same kind, so that coloured noise, distortion and an error of the model, which all
 spread over many bins, are no outliers.
+
+Lines of an FRF that depart in another way hold a tone: one after the other they are found, named, and left
+out of the fit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 from scipy import special
+from scipy.ndimage import median_filter
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
-from tactile_resonance.tones import level_around
+from tactile_resonance.frf.result import FRF
+from tactile_resonance.poles.result import PolesBatch, PolesStatus
+from tactile_resonance.tones import ROUNDING, Tone, level_around
 
 FALSE_ALARM = 1e-4
 """Probability that noise of a record has a bin taken for a tone."""
@@ -25,6 +34,8 @@ MEDIAN_LOSS = 2.5
 """Times the variance of a mean that a median of exponential powers counts as having: 2.1, and its tails."""
 CERTAIN_LEVERAGE = 0.99
 """A bin that the fit follows to this part cannot be tested."""
+ALIKE_LINES = 9
+"""Lines over which the variance counts as constant: that of one alone is too uncertain to divide by."""
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -118,3 +129,66 @@ def chances_of(
             ratio = power[kind] / np.maximum(level, least)[kind]
             chance[kind] = special.fdtrc(2 * records, 2 * dof, ratio)
     return chance
+
+
+def poles_without_tones(
+    fit: Callable[[FRF], PolesBatch], frf: FRF
+) -> tuple[PolesBatch, tuple[Tone, ...]]:
+    """Poles from an FRF, lines with a tone left out; see `tones.poles_without_tones` for records.
+
+    Parameters
+    ----------
+    fit : callable
+        Poles from lines, of which those that are not finite are left out.
+    frf : FRF
+        With (F,) arrays, the lines of the band.
+    """
+    whole = batch = fit(frf)
+    rest, found = frf, list[int]()
+    while (line := _most_striking(batch, rest)) is not None:
+        found.append(line)
+        g = rest.g.copy()
+        g[line] = np.nan
+        rest = replace(rest, g=g)
+        batch = fit(rest)
+        if len(found) > MOST_TONES or 1 in np.diff(np.sort(found)):
+            return whole, ()  # neighbours stand out, or too many: that is no tone
+    if batch.has_status(PolesStatus.MODEL_ERROR) or batch.has_status(PolesStatus.NOT_CONVERGED):
+        return whole, ()  # distortion, or what the model leaves out, may be that large on a line
+    spacing_hz = float(np.diff(frf.frequency_hz).min()) if found else 0.0
+    tones = []
+    for line in sorted(found):
+        frequency_hz = frf.frequency_hz[line]
+        rms_v = np.nan
+        if frf.actuator_amplitude is not None:
+            error = frf.g[line] - batch.fit.response(frequency_hz[None])[0]
+            rms_v = np.sqrt(2) * np.abs(error) * frf.actuator_amplitude[line]
+        tones.append(Tone(float(frequency_hz), float(rms_v), "sensor", spacing_hz))
+    return batch, tuple(tones)
+
+
+@np.errstate(all="ignore")
+def _most_striking(batch: PolesBatch, frf: FRF) -> int | None:
+    """The line that stands out most, if noise would not make it."""
+    fit, used = batch.fit, np.isfinite(frf.g)
+    variance = np.ones(used.size) if frf.variance is None else frf.variance
+    used &= np.isfinite(variance) & (variance > 0)
+    response = fit.response(frf.frequency_hz)
+    if not np.isfinite(response).all() or used.sum() <= batch.structure.fewest_lines:
+        return None
+    x = fit.variable.of_frequency(frf.frequency_hz)
+    p, q = (basis.at(x, 0)[0] for basis in (fit.denominator_basis, fit.numerator_basis))
+    smooth = median_filter(np.where(used, variance, np.median(variance[used])), ALIKE_LINES)
+    by_line = str(batch.variance_model) == "per line"
+    weight = used / np.sqrt(np.where(used, variance, 1.0) if by_line else smooth)
+    delay = np.exp(-2j * np.pi * frf.frequency_hz * fit.delay_s)
+    scale = weight * delay / (p @ fit.denominator)
+    error = np.asarray(np.where(used, frf.g - response, 0) * weight, complex)[None]
+    bases = p, q, np.empty((used.size, 0), complex)
+    none = np.zeros_like(used)
+    least = ROUNDING * np.mean(np.abs(response[used]) ** 2) * weight**2
+    power = falls_without_each(bases, response[None], np.ones_like(error), scale, error)[0]
+    dof = frf.dof if by_line and frf.dof else np.inf
+    chance = chances_of(power, [used, none, none], 1, np.where(used, least, 1.0), dof)
+    line = int(np.argmin(chance))
+    return line if chance[line] * used.sum() < FALSE_ALARM else None

@@ -12,11 +12,16 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
-from tactile_resonance.poles.covariance import modes_in_band, pole_quantities
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import RULES, Solution, minimise
 from tactile_resonance.poles.model import RationalModel, Variable
-from tactile_resonance.poles.significance import beside_others, second_order, significant_modes
+from tactile_resonance.poles.modes import (
+    beside_others,
+    modes_in_band,
+    pole_quantities,
+    second_order,
+    significant_modes,
+)
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.poles.covariance import real_covariance
+from tactile_resonance.poles.modes import real_covariance
 from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
 from tactile_resonance.poles.whiteness import SMOOTH_RESIDUAL
 

@@ -12,7 +12,7 @@ place of the one that is missed least, and so on while the cost falls.
 
 A wide mode across others is the hull of all of them where noise hides each alone. Its residue seems certain,
 while the others would take its place: it counts only where the model without it, fitted anew, is worse than
-noise explains (`significance.fall_of_noise`).
+noise explains (`modes.fall_of_noise`).
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from tactile_resonance.poles.fit import (
     minimise,
 )
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
+from tactile_resonance.poles.modes import fall_of_noise
 from tactile_resonance.poles.plan import FitPlan
-from tactile_resonance.poles.significance import fall_of_noise
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.lines_fit import LinesPlan

@@ -10,8 +10,8 @@ from scipy import special
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.poles.modes import in_any_direction
 from tactile_resonance.poles.result import Poles, PolesStatus
-from tactile_resonance.poles.significance import in_any_direction
 
 # Half the width of a mode, in bins, from which a polynomial of order 2 follows its transient at 40 dB.
 FEWEST_BINS = 16

@@ -19,7 +19,7 @@ from poles.mode_at_250_hz import (
 
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.poles.estimator import poles_of_frf
+from tactile_resonance.poles.estimator import choose_among, poles_of_frf
 from tactile_resonance.poles.identify import (
     identify_batch,
     identify_frf,
@@ -29,7 +29,6 @@ from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import (
     identify_poles_from_bins,
 )
-from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 

@@ -8,12 +8,12 @@ import pytest
 import scipy.signal
 
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.poles.estimator import choose_among
 from tactile_resonance.poles.identify import (
     identify_batch,
     identify_frf,
     identify_spectra,
 )
-from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 

@@ -20,12 +20,12 @@ from poles.mode_at_250_hz import (
 from scipy import stats
 
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.poles.estimator import choose_among
 from tactile_resonance.poles.identify import (
     identify_batch,
     identify_frf,
     identify_spectra,
 )
-from tactile_resonance.poles.order_choice import choose_among
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
