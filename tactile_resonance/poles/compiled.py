@@ -2,7 +2,9 @@
 """What fits call in compiled form, and how it is compiled: by numba, into its cache, once per installation.
 
 numba keeps the machine code beside each source, or in its own cache directory (NUMBA_CACHE_DIR). It looks at
-the date of that one file: functions that are compiled call none of other files.
+the date of that one file: functions that are compiled call none of other files. Its index names the classes
+of their arguments by module, and is read before that date: such classes (`data.BinData`, `tables.Tables`) stay
+where they are, else an installation that is renewed in place cannot read it.
 """
 
 from __future__ import annotations
