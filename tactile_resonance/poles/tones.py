@@ -72,7 +72,7 @@ class _Taken:
         return Tone(self.at * plan.resolution_hz, rms_v, self.channel, plan.resolution_hz)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def _leaving_out(plan: JointPlan, bins: tuple[int, ...]) -> JointPlan:
     """The plan without some bins; the latest ones are kept, for a tone is in many records."""
     return replace(plan, left_out=bins)
