@@ -6,6 +6,7 @@ The records of a point pool their noise.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,7 @@ def pieces_between(bins: int, records: int) -> Pieces:
     return Pieces.of(bins, size, records, records)
 
 
+@lru_cache(maxsize=64)
 def rules_between(bins: int, records: int) -> Rules:
     """Of fits that find the noise on so many bins themselves, where it is flat."""
     pieces = pieces_between(bins, records)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -99,15 +100,16 @@ class Judged:
     def of(cls, plan: FitPlan, lines: IntArray, **values: Any) -> Judged:
         """With a known level of noise, and nothing to remark, of what no value is given for."""
         batch, places = lines.size, plan.structure.order // 2
-        nothing = {
-            "level_known": np.ones(batch, bool),
-            "noise_variance": np.full((batch, 2), np.nan),
-            "systematic": np.zeros((batch, places, 2, 2)),
-            "lacking": np.full((batch, 3), np.nan),
-            "dispensable": np.zeros((batch, places), bool),
-            "remark": np.full(batch, "", object),
+        nothing: dict[str, tuple[tuple[int, ...], float | bool]] = {
+            "level_known": ((batch,), True),
+            "noise_variance": ((batch, 2), np.nan),
+            "systematic": ((batch, places, 2, 2), 0.0),
+            "lacking": ((batch, 3), np.nan),
+            "dispensable": ((batch, places), False),
         }
-        return cls(lines=lines, **{**nothing, **values})
+        for name in nothing.keys() - values.keys():
+            values[name] = np.full(*nothing[name])
+        return cls(lines=lines, remark=np.full(batch, "", object), **values)
 
     def put(self, rows: IntArray, others: Judged) -> None:
         """Write other points in place of some."""
@@ -185,8 +187,10 @@ def assemble(
     significant &= ~judged.dispensable
     if poles.shape[-1] > 2:
         significant &= ~_sum_of_hidden(poles, significant)
-    certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
-    significant |= _needed(plan, judged, poles, significant, certain, costs)
+    if (less := plan.poorer) is not None:
+        certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
+        asked = beside_others(poles, significant) & ~judged.dispensable & certain[:, None]
+        significant |= _needed(judged, structure.parameters, asked, partial(costs, less))
     remark, notes = judged.remark.copy(), [_without_lost_totals(quantities, significant)]
     if poles.shape[-1] > 1:
         notes.append(_widen(quantities, second_order(poles, significant, distance)))
@@ -242,25 +246,21 @@ def _lost_to_rounding(covariance: FloatArray) -> BoolArray:
 
 
 def _needed(
-    plan: Plan,
     judged: Judged,
-    poles: ComplexArray,
-    found: BoolArray,
-    asked: BoolArray,
-    costs: Callable[[Plan, IntArray], FloatArray],
+    parameters: int,
+    beside: BoolArray,
+    costs_with_less: Callable[[IntArray], FloatArray],
 ) -> BoolArray:
-    """(batch, k) modes beside others whose residue noise could make, but without which the fit is worse.
+    """(batch, k) modes `beside` others whose residue noise could make, but without which the fit is worse.
 
     Two modes nearer than their widths share what the lines say of them, so that the residue of one may be
     uncertain, and only a fit without it tells; see `modes.fall_of_noise`.
     """
-    less = plan.poorer
-    beside = beside_others(poles, found) & ~judged.dispensable & asked[:, None] & (less is not None)
     rows = np.flatnonzero(beside.any(axis=-1))
-    if less is not None and rows.size:
+    if rows.size:
         lines, expected = judged.lines[rows], judged.expected_cost[rows]
-        level = np.maximum(expected / (lines - plan.structure.parameters / 2), 1)
-        fall = costs(less, rows) - judged.cost[rows]
+        level = np.maximum(expected / (lines - parameters / 2), 1)
+        fall = costs_with_less(rows) - judged.cost[rows]
         beside[rows] &= (fall > level * fall_of_noise(lines))[:, None]
     return beside
 
@@ -269,6 +269,8 @@ def _without_lost_totals(quantities: dict[str, npt.NDArray], significant: BoolAr
     """Total covariances (batch, k, 2, 2) that rounding has made negative become NaN; notes of points."""
     total = quantities["total_covariance"]
     lost = (np.diagonal(total, axis1=-2, axis2=-1) <= 0).any(axis=-1)
+    if not lost.any():
+        return {}
     total[lost] = np.nan
     note = "the total covariance is lost to rounding: a smaller order has one"
     return dict.fromkeys(np.flatnonzero((lost & significant).any(axis=-1)).tolist(), note)
