@@ -21,6 +21,7 @@ from tactile_resonance.fields import require
 _ROUNDS = 50
 _CANDIDATES = 500  # among which the point in the middle of all is looked for
 _STARTS, _MOST_STEPS, _CONVERGED = 6, 1000, 1e-6  # of a mixture
+_ALIKE_POINTS = 2  # of the mean spread of all groups, which count in that of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +142,8 @@ def _squared(off: FloatArray, covariance: FloatArray) -> FloatArray:
 def _alike(x: FloatArray, total: FloatArray, precision: FloatArray) -> BoolArray:
     """(n,) points within the median distance of members of the point in the middle of all."""
     some = np.unique(np.linspace(0, len(x) - 1, _CANDIDATES).astype(int))
-    medians = [np.median(_squared(x - x[k], total + total[k])) for k in some]
+    # by the noise of the others: beside its own a point that is hardly known would be near to all
+    medians = [np.median(_squared(x - x[k], total)) for k in some]
     middle = some[int(np.argmin(medians))]
     alike = _squared(x - x[middle], total + total[middle]) <= special.chdtri(2, 0.5)
     alike[middle] = True
@@ -198,8 +200,11 @@ def find_clusters(
     covariances : (n, 2, 2) float
         Noise of each, above 0.
     spread : (2, 2) float, optional
-        Of each group where it is known; when absent each has its own, which is estimated.
+        Of each group where it is known; when absent each has its own, which is estimated together with two
+        points of the mean spread of all groups (as Friedman, J. Am. Stat. Assoc. 84 (1989) 165), so that a few
+        points that lie together by chance are no group of their own.
     most : int
+        Without `spread` not more than a quarter of the points, which could not show the spreads of more.
     seed : int
         Of the starts.
 
@@ -216,7 +221,8 @@ def find_clusters(
     scale = np.outer(unit, unit)
     known = None if spread is None else own / scale
     rng, tried = np.random.default_rng(seed), []
-    for count in range(1, min(most, n) + 1):
+    largest = n if spread is not None else max(1, n // 4)  # a mean and a covariance are five numbers
+    for count in range(1, min(most, largest) + 1):
         starts = [
             _mixture(x / unit, noise / scale, known, _seeds(x / unit, count, rng))
             for _ in range(_STARTS if count > 1 else 1)
@@ -282,7 +288,10 @@ def _mixture(
         mean = np.einsum("nk,nki->ki", probability, place) / members[:, None]
         about = place - mean
         scatter = about[..., :, None] * about[..., None, :] + left
-        covariance = np.einsum("nk,nkij->kij", probability, scatter) / members[:, None, None]
+        sums_of = np.einsum("nk,nkij->kij", probability, scatter)
+        # with that of all groups, without which the likelihood of a group about two points has no limit
+        alike = _ALIKE_POINTS * sums_of.sum(axis=0) / n
+        covariance = (sums_of + alike) / (members + _ALIKE_POINTS)[:, None, None]
     return weight, mean, covariance, probability, log_likelihood
 
 

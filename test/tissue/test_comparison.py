@@ -73,6 +73,22 @@ def test_the_rest_is_the_larger_group_wherever_it_lies():
     assert pairs_that_differ(x, noise, NONE).shape == (1, 1)
 
 
+def test_a_point_that_is_hardly_known_hides_no_difference():
+    """Two groups 13 deviations apart, and one point between them whose noise covers both: 100 maps."""
+    rng = np.random.default_rng(7)
+    noise = np.tile(covariance(0.3, 1e-3, 0.0), (51, 1, 1))
+    noise[50] = covariance(5.0, 0.02, 0.0)
+    shifts = np.repeat([[0.0, 0.0], [4.0, 0.0], [2.0, 0.0]], [30, 20, 1], axis=0)
+    missed, false = 0, 0
+    for _ in range(100):
+        x = MEAN + shifts + np.array([rng.multivariate_normal([0, 0], each) for each in noise])
+        differs = differences_from_rest(x, noise, NONE).differs
+        missed += int(np.sum(~differs[30:50]))
+        false += int(np.sum(differs[:30]))
+    assert missed <= 2
+    assert false <= stats.binom.ppf(0.9999, 3000, 0.05)
+
+
 def test_distances_are_those_of_a_point_from_the_mean_of_the_others():
     x, noise = points(np.random.default_rng(4), np.zeros((3, 2)), noisy=(1, 3))
     result = differences_from_rest(x, noise, NONE, 1e-9)
@@ -105,6 +121,20 @@ def test_one_tissue_is_one_group():
     rng = np.random.default_rng(6)
     for _ in range(10):
         assert len(find_clusters(*points(rng, np.zeros((25, 2)), noisy=(1, 8)), most=3).mean) == 1
+
+
+@pytest.mark.parametrize(("count", "most_split"), [(12, 0.25), (25, 0.05)])
+def test_few_points_that_lie_together_by_chance_are_no_group(count, most_split):
+    """One tissue that scatters a hundred times its noise: 40 maps; not more are split, at 99.9 %."""
+    rng, spread = np.random.default_rng(9), 1e4 * NOISE
+    split = [
+        len(find_clusters(*points(rng, np.zeros((count, 2)), spread)).mean) > 1 for _ in range(40)
+    ]
+    assert np.sum(split) <= stats.binom.ppf(0.999, 40, most_split)
+    # and two tissues are two
+    shifts = np.repeat([[0.0, 0.0], [14 * np.sqrt(spread[0, 0]), 0.0]], [count // 2] * 2, axis=0)
+    found = [len(find_clusters(*points(rng, shifts, spread)).mean) for _ in range(10)]
+    assert np.mean(np.array(found) >= 2) == 1
 
 
 def test_likelihood_and_criterion_are_those_of_their_definitions():
