@@ -189,7 +189,8 @@ def krige(
     scale = float(np.std(y)) or 1e-9 * (abs(float(y[0])) or 1.0)
     # starts over the lengths that the points resolve: a likelihood may have several maxima
     picked = np.unique(np.linspace(0, len(y) - 1, min(len(y), FIT_POINTS)).astype(int))
-    nearest = float(np.median(apart.min(axis=1)))
+    other = np.where(apart < 1e-9 * extent, np.inf, apart)  # places, not points
+    nearest = float(np.median(other.min(axis=1)))
     longest = min(10 * extent, most_length_m)
     lowest, highest = np.log(min(0.3 * nearest, longest)), np.log(longest)
     least, most = np.log(max(1e-4 * scale, least_std)), np.log(max(100 * scale, least_std))

@@ -2,11 +2,12 @@
 """Where a kriged quantity lies between two levels: its boundary, how sure that is, and what a touch would add.
 
 A place is taken to lie on the side of its kriged value. With the posterior N(m, s^2) there and its distance d
-to the nearest level this is wrong with probability Phi(-d/s). After one more touch, which leaves the standard
-deviation s' of s, it is expected to be wrong with probability 2 T(d/s, s' / sqrt(s^2 - s'^2)), T of Owen: the
-probability that the quantity and its kriged value after the touch, which are jointly Gaussian with correlation
-sqrt(1 - s'^2/s^2), lie on two sides of the level (Owen, Ann. Math. Stat. 27, 1956; Chevalier et al.,
-Technometrics 56, 2014, section 2).
+to the level, of one alone, this is wrong with probability Phi(-d/s). After one more touch, which leaves the
+standard deviation s' of s, it is expected to be wrong with probability 2 T(d/s, s' / sqrt(s^2 - s'^2)), T of
+Owen: the probability that the quantity and its kriged value after the touch, which are jointly Gaussian with
+correlation sqrt(1 - s'^2/s^2), lie on two sides of the level (Owen, Ann. Math. Stat. 27, 1956; Chevalier et
+al., Technometrics 56, 2014, section 2). Between two levels those of both add; outside that of the far one is
+taken off, which is exact of a touch that shows nothing or all.
 """
 
 from __future__ import annotations
@@ -60,13 +61,17 @@ class LevelSet:
     def wrong(self, value: FloatArray, std: FloatArray) -> FloatArray:
         """(...) probability that a place is taken to lie on the wrong side."""
         inside = self.inside(value, std)
-        return np.minimum(inside, 1 - inside)
+        return np.where(self.depth(value) > 0, 1 - inside, inside)
 
     def wrong_after(self, value: FloatArray, std: FloatArray, after: FloatArray) -> FloatArray:
         """(...) as it is expected after a touch that leaves the standard deviation `after`."""
         with np.errstate(divide="ignore"):
             ratio = after / np.sqrt(np.maximum(std**2 - after**2, 0))
-        return np.asarray(2 * owens_t(np.abs(self.depth(value)) / std, ratio))
+        low, high = np.abs(value - self.low), np.abs(self.high - value)
+        near, far = np.minimum(low, high) / std, np.maximum(low, high) / std
+        # what crosses both levels is on the wrong side from between them, and not from beside them
+        sign = np.where(self.depth(value) > 0, 1, -1)
+        return np.asarray(2 * owens_t(near, ratio) + sign * 2 * owens_t(far, ratio))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,5 +184,5 @@ def boundary_of(surface: KrigedSurface | TiledSurface, level_set: LevelSet, rast
         raster.lines(depth + reach),
         float(np.sum(inside)) * cell_m2,
         float(np.sum(np.sqrt(inside * (1 - inside)))) * cell_m2,
-        float(np.sum(np.minimum(inside, 1 - inside))) * cell_m2,
+        float(np.sum(level_set.wrong(value, std)[raster.within])) * cell_m2,
     )

@@ -96,6 +96,20 @@ def test_what_determines_nothing_is_refused(xy, noise, reason):
         krige(xy, np.arange(len(xy)), np.full(len(xy), noise))
 
 
+def test_two_measurements_of_each_place_are_as_good_as_their_mean():
+    """All places twice, with noise: the same as one value a place of half the variance."""
+    rng = np.random.default_rng(8)
+    at = np.stack(np.meshgrid(*[np.linspace(0, 0.01, 4)] * 2), axis=-1).reshape(-1, 2)
+    truth = draw(rng, at, 0.004, 2.0, 255.0)
+    both = truth + 0.3 * rng.standard_normal((2, 16))
+    twice = krige(np.concatenate([at, at]), both.ravel(), np.full(32, 0.3))
+    once = krige(at, both.mean(axis=0), np.full(16, 0.3 / np.sqrt(2)))
+    assert twice.length_m == pytest.approx(once.length_m, rel=0.02)
+    to = at + 1e-3
+    for found, expected in zip(twice.predict(to), once.predict(to), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0.02)
+
+
 def test_covariance_is_what_a_further_point_takes_away():
     """The variance that is left after one more measurement, by the covariance and by the points themselves."""
     rng = np.random.default_rng(6)

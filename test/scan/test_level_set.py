@@ -23,6 +23,20 @@ def test_a_place_is_on_the_wrong_side_as_often_as_stated():
     inside = norm.cdf(256.0, value, 0.5) - norm.cdf(254.0, value, 0.5)
     np.testing.assert_allclose(between.inside(value, np.full(3, 0.5)), inside)
     np.testing.assert_array_equal(between.depth(value) > 0, [False, True, False])
+    np.testing.assert_allclose(
+        between.wrong(value, np.full(3, 0.5)), [inside[0], 1 - inside[1], inside[2]]
+    )
+
+
+def test_a_narrow_band_is_wrong_as_often_as_stated_where_little_is_known():
+    """A band much narrower than the deviation: within it most places are wrong. Drawn; within 4 errors."""
+    rng, runs = np.random.default_rng(3), 100_000
+    band, value, std = LevelSet(254.0, 256.0), np.array([255.3, 253.0]), np.array([3.0, 3.0])
+    truth = value[:, None] + std[:, None] * rng.standard_normal((2, runs))
+    drawn = np.mean((band.depth(truth) > 0) != (band.depth(value) > 0)[:, None], axis=1)
+    stated = band.wrong(value, std)
+    assert np.all(np.abs(drawn - stated) < 4 * np.sqrt(stated * (1 - stated) / runs))
+    assert stated[0] > 0.7
 
 
 @pytest.mark.parametrize(
@@ -40,8 +54,9 @@ def test_after_a_touch_it_is_wrong_as_often_as_was_expected(value, std, after):
 
 def test_a_touch_that_shows_nothing_changes_nothing_and_an_exact_one_ends_all_doubt():
     above, value, std = LevelSet(low=255.0), np.array([254.0, 255.2]), np.array([1.0, 0.3])
-    np.testing.assert_allclose(above.wrong_after(value, std, std), above.wrong(value, std))
-    np.testing.assert_allclose(above.wrong_after(value, std, 0 * std), 0, atol=1e-15)
+    for wanted in (above, LevelSet(253.8, 255.0), LevelSet(255.0, 255.5), LevelSet(high=255.0)):
+        np.testing.assert_allclose(wanted.wrong_after(value, std, std), wanted.wrong(value, std))
+        np.testing.assert_allclose(wanted.wrong_after(value, std, 0 * std), 0, atol=1e-15)
 
 
 def cone(xy, radius=0.005, slope_hz_per_m=800.0):
