@@ -174,7 +174,13 @@ class CalibratedEstimator:
         air_hz = float(f[np.argmin(np.maximum(0, np.maximum(low - f, f - high)))])
         prior = ContactPrior(self.law, self.tip_radius_m, air_hz, force_n, force_std_n)
         fit = _Fit(self.calibration, record, prior)
-        return fit.result(*fit.solved(prior.start))
+        p, converged = fit.solved(prior.start)
+        if not converged:  # residuals on the way would contradict any calibration
+            again = _Fit(self.calibration, record, prior)
+            further = again.solved(prior.further_start)
+            if further[1]:
+                return again.result(*further)
+        return fit.result(p, converged)
 
 
 class _Fit:

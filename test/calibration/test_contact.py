@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 from calibration.played import SKEW_S, contact_of, played
 
-from tactile_resonance.calibration.contact import ContactStatus, Law, moduli
-from tactile_resonance.calibration.estimator import CalibratedEstimator
+import tactile_resonance as tr
+from tactile_resonance.calibration.contact import (
+    LOG_RELAXED_STD,
+    ContactPrior,
+    ContactStatus,
+    Law,
+    moduli,
+)
+from tactile_resonance.calibration.estimator import CalibratedEstimator, ContactRecord
 from tactile_resonance.calibration.model import SensorModel
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import PolesStatus, natural_frequency_and_damping
 
 LIBRARY = ("gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver", "tumour")
 FORCE_N = 0.01
@@ -138,6 +145,46 @@ def test_few_false_alarms(known, bench, library):
         found = known(played(bench, contact, seed=seed, skew_s=SKEW_S), FORCE_N)
         alarms += found.status is not ContactStatus.OK
     assert alarms == 0
+
+
+def test_contacts_as_they_are_expected_contradict_nothing(given):
+    """60 contacts drawn within what is expected, two settled periods each; some lie in curved valleys."""
+    prior = ContactPrior(Law.STANDARD_LINEAR_SOLID, 0.0025, 236.0, FORCE_N)
+    known = CalibratedEstimator(replace(given, covariance=0 * given.covariance), 0.0025)
+    sine = tr.design_multisine(
+        sample_rate_hz=5e3, samples_per_period=2000, band_hz=(200.0, 330.0), seed=1
+    )
+    u, s = np.tile(sine.period(), (2, 1)), 2j * np.pi * sine.frequency_hz
+    std_v = given.noise_v_per_root_hz * np.sqrt(2500)
+    status, off = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        p = prior.start + rng.normal(0, [0.2, 1.0, 0.7, 0])
+        p[3] -= LOG_RELAXED_STD / 3 * (prior.deviations(p)[2] + rng.standard_normal())
+        contact, y = prior.stiffness(p), np.zeros(1001, complex)
+        y[sine.harmonics] = given.model.response(s, contact.at(s))
+        y = np.fft.irfft(y * np.fft.rfft(u), 2000) + std_v * rng.standard_normal(u.shape)
+        record = ContactRecord.of_samples(
+            u,
+            y,
+            sample_rate_hz=5e3,
+            harmonics=sine.harmonics,
+            band_hz=(200.0, 330.0),
+            from_rest=False,
+        )
+        found = known(record, FORCE_N)
+        status.append(found.status)
+        poles = given.model.poles(contact)
+        f0_hz, damping = natural_frequency_and_damping(poles[poles.imag > 0])
+        at = np.argmin(np.abs(f0_hz - found.poles.main.f0_hz))
+        main = found.poles.main
+        if found.status is not ContactStatus.OK:
+            continue
+        off.append((main.estimate - [f0_hz[at], damping[at]]) / main.std)
+    assert ContactStatus.CONTRADICTED not in status
+    assert status.count(ContactStatus.OK) >= 59
+    assert np.abs(off).max() < 4.5
+    assert np.mean(np.abs(off) < 1.96) > 0.9
 
 
 def test_an_uncertain_sensor_makes_the_contact_uncertain(bench, given, library):
