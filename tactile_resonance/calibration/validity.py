@@ -122,8 +122,12 @@ def check_in_air(
         f"mode {k + 1} at {f:.2f} Hz: {1e2 * s:+.3f} %, damping {c:+.2g}"
         for k, f, s, c in zip(mode, at[:, 0], shifts, changes, strict=True)
     )
-    if unlike or damaged or abs(shift) > MOST_SHIFT:
+    blind = special.chdtrc(1, (MOST_SHIFT / shift_std) ** 2) >= SIGNIFICANT
+    if unlike or damaged or (moved and abs(shift) > MOST_SHIFT):
         state = SensorState.CHANGED
+    elif blind:  # not even a shift that means damage would show
+        text = f"poles in air too uncertain: frequencies to {1e2 * shift_std:.2g} % ({figures})"
+        return Validity(SensorState.UNKNOWN, shift, shift_std, text)
     elif moved:
         state = SensorState.TEMPERATURE if mode.size > 1 else SensorState.SHIFTED
     else:

@@ -89,6 +89,25 @@ def test_without_a_covariance_nothing_is_said(fitted):
     assert not found.usable
 
 
+@pytest.mark.parametrize(("relative_std", "blind"), [(1.5e-3, False), (5e-3, True), (0.03, True)])
+def test_poles_too_uncertain_to_tell_are_neither_damage_nor_as_calibrated(fitted, relative_std, blind):
+    """200 draws of an unchanged sensor; damage by chance, 1e-4 a test, at most once at 99.9 %."""
+    (expected, *_), _ = poles_in_air(fitted.calibration)
+    std = np.array([relative_std * expected[0], relative_std])
+    states = []
+    for seed in range(200):
+        noise = std * np.random.default_rng(seed).standard_normal(2)
+        states.append(
+            check_in_air(fitted.calibration, [expected + noise], [np.diag(std**2)]).state
+        )
+    assert states.count(SensorState.CHANGED) <= 1
+    right = SensorState.UNKNOWN if blind else SensorState.AS_CALIBRATED
+    assert states.count(right) >= 199
+    # and damage that the poles do show is stated
+    far = check_in_air(fitted.calibration, [expected * [1.2, 1]], [np.diag(std**2)])
+    assert far.state is SensorState.CHANGED
+
+
 def test_a_shifted_calibration_finds_the_contact_of_the_warmer_sensor(fitted, bench, library):
     warm = with_beam(bench, piezo_modulus_pa=0.995, shim_modulus_pa=0.995)
     tissue = library["gel12"]
