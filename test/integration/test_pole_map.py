@@ -116,8 +116,9 @@ def scanned(module_domain, tmp_path_factory):
         assert (result.done, result.failed, result.skipped) == (3, 1, 0), result.message
         cloud = late_map(len(ACCEPTED))
         told = late_reader(msg.PointResult, "point_result", POINT_RESULTS, lambda m: len(m) == 7)
-        final = [message.poles[0] for message in told if message.poles]
-        poles = late_reader(msg.Poles, "poles", POLES, lambda m: all(p in m for p in final))
+        # as text, in which NaN is equal to NaN
+        final = {str(message.poles[0]) for message in told if message.poles}
+        poles = late_reader(msg.Poles, "poles", POLES, lambda m: final <= set(map(str, m)))
         seen = joined.result()
     return run, cloud, told, poles, seen
 
@@ -264,6 +265,7 @@ def late_reader(kind, topic, qos, enough, heard=None):
         deadline = time.monotonic() + HANGS_S
         while not enough(heard) and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)
+        assert enough(heard), f"{len(heard)} of {topic} in {HANGS_S:g} s"
         deadline = time.monotonic() + 0.5
         while time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)
