@@ -369,8 +369,10 @@ async def in_thread(node: ManagedNode, work: Callable[[], Any], name: str) -> An
             set_it = partial(finished.set_result, work())
         except Exception as error:
             set_it = partial(finished.set_exception, error)
-        with contextlib.suppress(AttributeError, InvalidHandle):  # the node has gone, nobody waits
-            node.executor.create_task(set_it)
+        executor = node.executor
+        if executor is not None:  # else the node has gone, and nobody waits
+            with contextlib.suppress(InvalidHandle):
+                executor.create_task(set_it)
 
     threading.Thread(target=run, name=name, daemon=True).start()
     return await finished
