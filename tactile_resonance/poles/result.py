@@ -168,7 +168,7 @@ class Poles:
         return (self, *self.further)
 
     def noting(self, *notes: str) -> Poles:
-        """With notes added to the message; empty ones are none."""
+        """Return these poles with notes added to the message; empty notes are left out."""
         return replace(self, message="; ".join(filter(None, [self.message, *notes])))
 
     @property
