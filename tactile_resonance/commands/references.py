@@ -15,7 +15,7 @@ from tactile_resonance.files import write_whole
 
 if TYPE_CHECKING:
     from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
-    from tactile_resonance.frf.nested import VarianceAnalysis
+    from tactile_resonance.frf.variance_analysis import VarianceAnalysis
     from tactile_resonance.scan.labels import LabelOf
     from tactile_resonance.scan.point_result import PointResult
     from tactile_resonance.scan.run_content import RunContent
@@ -205,7 +205,7 @@ def print_variance(
     g: ComplexArray, frequency_hz: FloatArray, groups: IntArray, band_hz: tuple[float, float]
 ) -> tuple[VarianceAnalysis, VarianceAnalysis]:
     """Variance by source over all lines and in a band, of which it prints the sources."""
-    from tactile_resonance.frf.nested import analyse_variance
+    from tactile_resonance.frf.variance_analysis import analyse_variance
 
     inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
     whole = analyse_variance(g, frequency_hz, groups)

@@ -17,7 +17,7 @@ from tactile_resonance.analysis import Analysis
 from tactile_resonance.calibration.fit import Fitted
 from tactile_resonance.calibration.records import Load
 from tactile_resonance.frf.distortion import DetectionLines, Distortion
-from tactile_resonance.frf.nested import VarianceAnalysis
+from tactile_resonance.frf.variance_analysis import VarianceAnalysis
 from tactile_resonance.report.drawing import decibel, draw_ellipse, new_figure
 
 

@@ -14,7 +14,7 @@ from scipy import special
 
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
-from tactile_resonance.frf.nested import NestedMeans, nested_means
+from tactile_resonance.frf.variance_analysis import NestedMeans, nested_means
 from tactile_resonance.tissue.classify import TissueClass, predictive_class
 
 Texts = npt.NDArray[np.str_]

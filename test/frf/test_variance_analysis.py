@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.frf.nested import PAPER_AXES, analyse_variance
+from tactile_resonance.frf.variance_analysis import PAPER_AXES, analyse_variance
 
 LINES_HZ = np.arange(1.0, 401.0)
 

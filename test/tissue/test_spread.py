@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 from tissue.reference_points import NOISE, SOURCES, drawn, joined
 
-from tactile_resonance.frf.nested import nested_means
+from tactile_resonance.frf.variance_analysis import nested_means
 from tactile_resonance.tissue.classify import classify
 from tactile_resonance.tissue.spread import LEVELS, not_negative, spreads_of
 

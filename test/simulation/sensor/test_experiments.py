@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from tactile_resonance.frf.distortion import estimate_distortion
-from tactile_resonance.frf.nested import analyse_variance
 from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.frf.variance_analysis import analyse_variance
 from tactile_resonance.simulation.sensor.experiments import records_at_levels, repeated_records
 
 
