@@ -182,8 +182,9 @@ class _Records:
             "rate right?"
         )
         require(bool(np.isfinite(self.residual(start)).all()), "records", names, accepted)
+        # there are no bounds: a QR of the long Jacobian is enough, "trf" takes its singular values
         found = optimize.least_squares(
-            residual, np.zeros(scale.size), jacobian, x_scale="jac", method="trf", max_nfev=steps
+            residual, np.zeros(scale.size), jacobian, x_scale="jac", method="lm", max_nfev=steps
         )
         x = whole(found.x)
         of_active = np.linalg.inv(found.jac.T @ found.jac) * np.outer(scale, scale)
