@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, lapack
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -201,6 +201,7 @@ def krige(
                 _cost,
                 np.array([start, first]),
                 args=(distances[np.ix_(picked, picked)], y[picked], noise[picked]),
+                jac=True,
                 method="L-BFGS-B",
                 bounds=[(lowest, highest), (least, most)],
             )
@@ -219,12 +220,33 @@ def _surface(
     return KrigedSurface(xy_m, y, length, size, _mean(factor, y)[0], factor)
 
 
-def _cost(x: FloatArray, distances: FloatArray, y: FloatArray, noise: FloatArray) -> float:
-    """Minus the logarithm of the restricted likelihood, but for a constant."""
-    factor = _factor(distances, noise, *np.exp(x).tolist())
-    mean, known = _mean(factor, y)
-    log_volume = 2 * np.sum(np.log(np.diag(factor[0]))) + np.log(known)
-    return float(0.5 * ((y - mean) @ cho_solve(factor, y - mean) + log_volume))
+def _cost(
+    x: FloatArray, distances: FloatArray, y: FloatArray, noise: FloatArray
+) -> tuple[float, FloatArray]:
+    """Minus the logarithm of the restricted likelihood, but for a constant, and its (2,) derivatives.
+
+    By a parameter that changes the covariance C by C' they are half the sum of ``G C'`` over all elements, with
+    ``G = C^-1 - w w^T / (1^T w) - a a^T``, ``w = C^-1 1`` and ``a = C^-1 (y - mean)``.
+    """
+    length, size = np.exp(x).tolist()
+    scaled = np.sqrt(5) * distances / length
+    decay = size**2 * np.exp(-scaled)
+    process = (1 + scaled + scaled**2 / 3) * decay + np.diag(np.full(len(y), _JITTER * size**2))
+    lower, failed = lapack.dpotrf(process + np.diag(noise**2), lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance of the values is not positive definite")
+    solved, _ = lapack.dpotrs(lower, np.stack([np.ones(len(y)), y], axis=1), lower=True)
+    weights, known = solved[:, 0], solved[:, 0].sum()
+    mean = weights @ y / known
+    gap = solved[:, 1] - mean * weights
+    log_volume = 2 * np.sum(np.log(np.diag(lower))) + np.log(known)
+    half = np.tril(lapack.dpotri(lower, lower=True)[0])
+    inverse = half + np.tril(half, -1).T
+    slope = inverse - np.outer(weights, weights) / known - np.outer(gap, gap)
+    by_length = np.sum(slope * scaled**2 * (1 + scaled) / 3 * decay)
+    by_size = 2 * np.sum(slope * process)
+    cost = 0.5 * ((y - mean) @ gap + log_volume)
+    return float(cost), np.array([by_length, by_size]) / 2
 
 
 def _mean(factor: tuple[FloatArray, bool], y: FloatArray) -> tuple[float, float]:

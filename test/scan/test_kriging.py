@@ -136,6 +136,27 @@ def test_covariance_is_what_a_further_point_takes_away():
     np.testing.assert_allclose(update, left, rtol=1e-6, atol=1e-9)
 
 
+def test_length_and_size_are_of_greatest_restricted_likelihood():
+    """By its textbook form: one percent more or less of either makes it smaller."""
+    rng = np.random.default_rng(9)
+    xy = rng.uniform(0, 0.02, (25, 2))
+    noise = rng.uniform(0.05, 0.3, 25)
+    y = draw(rng, xy, 0.006, 2.0, 255.0) + noise * rng.standard_normal(25)
+    distance = np.linalg.norm(xy[:, None] - xy, axis=-1)
+
+    def cost(length, std):
+        covariance = std**2 * matern(distance, length) + np.diag(noise**2)
+        inverse = np.linalg.inv(covariance)
+        gap = y - np.sum(inverse @ y) / np.sum(inverse)
+        volume = np.linalg.slogdet(covariance)[1] + np.log(np.sum(inverse))
+        return 0.5 * (gap @ inverse @ gap + volume)
+
+    found = krige(xy, y, noise)
+    least = cost(found.length_m, found.process_std)
+    for change in ((1.01, 1.0), (1 / 1.01, 1.0), (1.0, 1.01), (1.0, 1 / 1.01)):
+        assert cost(found.length_m * change[0], found.process_std * change[1]) > least
+
+
 def test_length_and_size_stay_within_what_is_known_beforehand():
     xy = np.random.default_rng(7).uniform(0, 0.02, (9, 2))
     flat = krige(xy, np.full(9, 254.0), np.full(9, 0.02), most_length_m=0.004, least_std=1.0)
