@@ -98,8 +98,7 @@ class ManagerNode(Node):
         self.health = Health(self, self._summary, self._details)
         self.create_service(Trigger, "~/start", partial(self._want, True))
         self.create_service(Trigger, "~/shut_down", partial(self._want, False))
-        self.create_timer(QUIET_S, self._tick, clock=STEADY)
-        self._often = self.create_timer(TICK_S, self._tick, clock=STEADY)  # until all are up
+        self._timer = self.create_timer(TICK_S, self._tick, clock=STEADY)
 
     def _managed(self, name: str) -> _Managed:
         node = _Managed(
@@ -140,10 +139,10 @@ class ManagerNode(Node):
         if clear and self._wanted_up and not self._was_up:
             self.get_logger().info(f"all active: {', '.join(node.name for node in self._nodes)}")
         self._was_up = clear and self._wanted_up
-        if self._was_up:
-            self._often.cancel()
-        elif self._often.is_canceled():
-            self._often.reset()
+        period_ns = round(1e9 * (QUIET_S if self._was_up else TICK_S))
+        if self._timer.timer_period_ns != period_ns:
+            self._timer.timer_period_ns = period_ns
+            self._timer.reset()
 
     def _advance(self, node: _Managed, moves: dict[int, int]) -> None:
         """One step of one node: a question asked, unless one is under way."""

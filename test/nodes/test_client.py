@@ -38,20 +38,25 @@ class Stack:
     """scan_node without a robot, alone, and a user's node."""
 
     def __init__(self, executor, folder):
-        self.executor = executor
+        self.executor = executor  # of the user; scan_node is a process of its own elsewhere, with one thread
+        self.own = SingleThreadedExecutor()
         self.scan_node = ScanNode()
         self.user = Node("user")
         self.client = TactileClient(self.user)
         self.folder = folder
-        for node in (self.scan_node, self.user):
-            executor.add_node(node)
+        self.own.add_node(self.scan_node)
+        executor.add_node(self.user)
+
+    def spin_once(self, timeout_s):
+        self.own.spin_once(timeout_s / 2)
+        self.executor.spin_once(timeout_s / 2)
 
     def activate(self):
         self.scan_node.trigger_configure()
         self.scan_node.trigger_activate()
 
     def until(self, holds):
-        assert spin_until(self.executor, holds)
+        assert spin_until(self, holds)
 
     def ended(self, future):
         self.until(future.done)
@@ -84,6 +89,7 @@ def stack(request, tmp_path):
             made.user.destroy_node()
             made.scan_node.destroy_node()
             made.executor.shutdown()
+            made.own.shutdown()
 
 
 @pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
@@ -203,7 +209,7 @@ def test_results_of_points_come_while_a_scan_is_under_way(stack):
 
     publisher = stack.user.create_publisher(PointResult, "point_result", POLES)
     publisher.publish(PointResult(label="of a scan before"))
-    spin_until(stack.executor, lambda: False, 0.5)
+    spin_until(stack, lambda: False, 0.5)
     future = stack.begin([], on_point=on_point)
     labels = [f"point {k}" for k in range(20)]
     for label in labels:
@@ -214,7 +220,7 @@ def test_results_of_points_come_while_a_scan_is_under_way(stack):
     stack.client.cancel()
     stack.ended(future)
     publisher.publish(PointResult(label="of a scan after"))
-    assert not spin_until(stack.executor, lambda: len(points) > len(labels), 0.5)
+    assert not spin_until(stack, lambda: len(points) > len(labels), 0.5)
 
 
 def test_an_outcome_can_be_awaited(stack):
@@ -267,11 +273,11 @@ def test_a_node_that_is_not_active_is_waited_for(stack):
     outcome = stack.ended(stack.client.scan(**GOAL, wait_s=2.0))
     assert outcome == ScanOutcome(Ending.REJECTED, "scan_node is not active, for 2 s")
     future = stack.client.scan(**GOAL)
-    assert not spin_until(stack.executor, future.done, 0.5)
+    assert not spin_until(stack, future.done, 0.5)
     stack.client.cancel()
     assert stack.ended(future).ending is Ending.CANCELLED
     future = stack.client.scan(**{**GOAL, "frame": "camera"})
-    assert not spin_until(stack.executor, future.done, 0.5)
+    assert not spin_until(stack, future.done, 0.5)
     stack.scan_node.trigger_activate()
     assert "got 'camera'" in stack.ended(future).message
     # what it had against the last goal is nothing against the next
@@ -285,7 +291,7 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     stack.activate()
     heard = []
     future = stack.begin(heard, run_directory="named by the node")
-    stack.executor.remove_node(stack.scan_node)
+    stack.own.remove_node(stack.scan_node)
     stack.scan_node.trigger_deactivate()
     stack.scan_node.trigger_cleanup()
     outcome = stack.ended(future)
