@@ -3,17 +3,20 @@
 
 Ordinary kriging: an unknown constant mean and a Matern covariance of smoothness 5/2, whose length and size
 are those of greatest restricted likelihood (Rasmussen and Williams, Gaussian Processes for Machine Learning,
-2006, chapters 2, 4 and 5).
+2006, chapters 2, 4 and 5). Few points determine these badly: there what is known is a mixture over the lengths
+and sizes that they allow, each with its likelihood, no logarithm of either preferred beforehand (Handcock and
+Stein, Technometrics 35, 1993).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve, lapack
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -28,8 +31,48 @@ FIT_POINTS = 100
 # section 3.6, moving neighbourhood).
 MOST_JOINT = 1000
 _NEIGHBOURS, _ALONG = 300, 12  # of a tile; tiles along the longer side
+MIXED_POINTS = 40
+"""Up to so many points the uncertainty of length and size counts: of more it adds less than a tenth."""
+# Of the mixture: steps of the logarithm of the length; sizes in standard deviations of theirs; least share of
+# the largest.
+_LENGTH_STEP, _SIZE_STEPS, _LEAST_SHARE = 0.7, (-1.3, 0, 1.3, 2.6), 0.1
 # Of the variance of the process; below it neighbours are too much alike to invert their covariance.
 _JITTER = 1e-10
+
+
+class _Process(NamedTuple):
+    """A process of one length and size, with the points known.
+
+    Attributes
+    ----------
+    xy_m : (n, 2) float
+    values : (n,) float
+    length_m, std, mean : float
+    factor : tuple
+        Of the covariance of the values, of `scipy.linalg.cho_factor`.
+    """
+
+    xy_m: FloatArray
+    values: FloatArray
+    length_m: float
+    std: float
+    mean: float
+    factor: tuple[FloatArray, bool]
+
+    def before(self, a_m: FloatArray, b_m: FloatArray) -> FloatArray:
+        """(p, q) covariance between (p, 2) and (q, 2) positions while no value is known."""
+        return np.asarray(self.std**2 * _matern(cdist(a_m, b_m) / self.length_m))
+
+    def at(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """At (q, 2) positions: value (q,); covariance with the points (n, q); their weights (n, q); (q,).
+
+        The last is what the mean's uncertainty adds, as a standard deviation with a sign.
+        """
+        cross = self.before(self.xy_m, at_m)
+        weights = cho_solve(self.factor, cross)
+        known = _mean(self.factor, self.values)[1]
+        of_mean = (1 - np.sum(weights, axis=0)) / np.sqrt(known)
+        return self.mean + (self.values - self.mean) @ weights, cross, weights, of_mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,49 +83,55 @@ class KrigedSurface:
     ----------
     xy_m : (n, 2) float
         Points measured.
-    values : (n,) float
     length_m : float
-        Distance over which the quantity changes.
+        Distance over which the quantity changes: of greatest likelihood.
     process_std : float
-        How much it varies.
-    mean : float
-    factor : tuple
-        Of the covariance of the values, of `scipy.linalg.cho_factor`.
+        How much it varies: as well.
+    processes : tuple of k
+        Of lengths and sizes that the points allow; one where many points determine these.
+    shares : (k,) float
+        Their probabilities.
     """
 
     xy_m: FloatArray
-    values: FloatArray
     length_m: float
     process_std: float
-    mean: float
-    factor: tuple[FloatArray, bool]
+    processes: tuple[_Process, ...]
+    shares: FloatArray
+
+    @property
+    def likeliest(self) -> KrigedSurface:
+        """By the process of the largest share alone."""
+        best = self.processes[int(np.argmax(self.shares))]
+        return replace(self, processes=(best,), shares=np.ones(1))
 
     def predict(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(...) value and its standard deviation at (..., 2) positions.
 
         The standard deviation is that of the quantity itself, not of a new measurement of it; it
-        includes that of the mean, but not that of length and size.
+        includes that of the mean and, of up to `MIXED_POINTS` points, of length and size.
         """
         at = np.asarray(xy_m, float)
-        cross, weights, of_mean = self._weights(at.reshape(-1, 2))
-        value = self.mean + (self.values - self.mean) @ weights
-        variance = self.process_std**2 - np.sum(cross * weights, axis=0) + of_mean**2
-        std = np.sqrt(np.maximum(variance, 0))
-        return value.reshape(at.shape[:-1]), std.reshape(at.shape[:-1])
+        values, variances = [], []  # of each process (q,)
+        for process in self.processes:
+            value, cross, weights, of_mean = process.at(at.reshape(-1, 2))
+            values.append(value)
+            variances.append(process.std**2 - np.sum(cross * weights, axis=0) + of_mean**2)
+        value = self.shares @ values
+        variance = self.shares @ (np.maximum(variances, 0) + (values - value) ** 2)
+        return value.reshape(at.shape[:-1]), np.sqrt(variance).reshape(at.shape[:-1])
 
     def covariance(self, a_m: npt.ArrayLike, b_m: npt.ArrayLike) -> FloatArray:
         """(p, q) covariance of the quantity between (p, 2) and (q, 2) positions, as `predict` knows it."""
         a, b = np.asarray(a_m, float), np.asarray(b_m, float)
-        (cross, _, of_a), (_, weights, of_b) = self._weights(a), self._weights(b)
-        before = self.process_std**2 * _matern(cdist(a, b) / self.length_m)
-        return np.asarray(before - cross.T @ weights + np.outer(of_a, of_b))
-
-    def _weights(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n, q) covariance with the points and their weights; (q,) what the mean's uncertainty adds."""
-        cross = self.process_std**2 * _matern(cdist(self.xy_m, at_m) / self.length_m)
-        weights = cho_solve(self.factor, cross)
-        known = _mean(self.factor, self.values)[1]
-        return cross, weights, (1 - np.sum(weights, axis=0)) / np.sqrt(known)
+        total, means_a, means_b = np.zeros((len(a), len(b))), [], []
+        for share, process in zip(self.shares, self.processes, strict=True):
+            (mean_a, cross, _, of_a), (mean_b, _, weights, of_b) = process.at(a), process.at(b)
+            total += share * (process.before(a, b) - cross.T @ weights + np.outer(of_a, of_b))
+            means_a.append(mean_a)
+            means_b.append(mean_b)
+        apart_a, apart_b = (np.array(means) - self.shares @ means for means in (means_a, means_b))
+        return np.asarray(total + (self.shares[:, None] * apart_a).T @ apart_b)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,15 +258,71 @@ def krige(
         ),
         key=lambda found: found.fun,
     )
-    length, size = np.exp(best.x).tolist()
-    return _surface(xy, y, noise, length, size)
+    if len(y) > MIXED_POINTS:
+        return _surface(xy, y, noise, *np.exp(best.x).tolist())
+    spread = _spread(best.x, (lowest, min(highest, np.log(3 * extent))), (least, most), distances, y, noise)
+    return _mixture(xy, y, noise, best.x, *spread)
+
+
+def _spread(
+    best: FloatArray,
+    lengths: tuple[float, float],
+    sizes: tuple[float, float],
+    distances: FloatArray,
+    y: FloatArray,
+    noise: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Logarithms (k, 2) of length and size about the best, within bounds, and their probabilities (k,)."""
+    steps = np.arange(-20, 21) * _LENGTH_STEP + best[0]
+    inside = (steps >= lengths[0]) & (steps <= lengths[1])
+    inside[20] = True  # the best itself
+    at, log_share = [], []
+    for log_length in steps[inside]:
+
+        def cost(log_size: float, log_length: float = log_length) -> tuple[float, FloatArray]:
+            return _cost(np.array([log_length, log_size]), distances, y, noise)
+
+        found = minimize_scalar(
+            lambda size, cost=cost: cost(size)[0], bounds=sizes, method="bounded", options={"xatol": 0.05}
+        )
+        middle = float(found.x)
+        # half of the chi-square of the values where they are exact, wider where noise hides the size
+        step = 1 / np.sqrt(2 * (len(y) - 1))
+        bend = (cost(middle + step)[1][1] - cost(middle - step)[1][1]) / (2 * step)
+        std = 1 / np.sqrt(min(max(bend, 1.0), 1 / step**2))
+        for k in _SIZE_STEPS:
+            log_size = middle + k * std
+            if sizes[0] <= log_size <= sizes[1]:
+                at.append((log_length, log_size))
+                log_share.append(np.log(std) - cost(log_size)[0])
+    share = np.exp(np.array(log_share) - max(log_share))
+    kept = share > _LEAST_SHARE
+    return np.array(at)[kept], share[kept] / share[kept].sum()
+
+
+def _mixture(
+    xy_m: FloatArray,
+    y: FloatArray,
+    noise: FloatArray,
+    best: FloatArray,
+    at: FloatArray,
+    shares: FloatArray,
+) -> KrigedSurface:
+    """A surface of some processes, given by logarithms (k, 2) of length and size."""
+    processes = []
+    for length, std in np.exp(at).tolist():
+        factor = _factor(cdist(xy_m, xy_m), noise, length, std)
+        processes.append(_Process(xy_m, y, length, std, _mean(factor, y)[0], factor))
+    length_m, process_std = np.exp(best).tolist()
+    return KrigedSurface(xy_m, length_m, process_std, tuple(processes), shares)
 
 
 def _surface(
     xy_m: FloatArray, y: FloatArray, noise: FloatArray, length: float, size: float
 ) -> KrigedSurface:
-    factor = _factor(cdist(xy_m, xy_m), noise, length, size)
-    return KrigedSurface(xy_m, y, length, size, _mean(factor, y)[0], factor)
+    """A surface of one process."""
+    best = np.log([length, size])
+    return _mixture(xy_m, y, noise, best, best[None], np.ones(1))
 
 
 def _cost(
