@@ -31,12 +31,14 @@ from tactile_resonance.poles.compiled import entry, inner
 
 BLOCK = 48
 """Bins taken together: a multiple of the vectors of all processors, and few enough for the cache."""
+CACHE_LINE = 64  # bytes
 GROUP = 16
 """Records that are fitted side by side."""
 
 # Rows of a block in the memory of a kernel: real parts of A, B, C, the error E, and behind each the
 # imaginary ones; one over the variance of E.
 ROW_A, ROW_B, ROW_C, ROW_E, ROW_V = 0, 2, 4, 6, 8
+ROW_POWER = ROW_V  # |E|^2 of undriven bins
 # Then weights, in the order of their rows, complex ones real part first. With X = Y - E and w = 1 / (|A|^2
 # v): w |X|^2, -w conj(X), w; the gradient by A, and minus that by C. With an input: -w conj(X) U, w |U|^2,
 # w conj(U); minus the gradient by B.
@@ -52,6 +54,11 @@ ROW_AA, ROW_AC, ROW_CC, ROW_OF_A, ROW_OF_C, ROW_AB, ROW_BB, ROW_BC, ROW_OF_B = (
     22,
 )
 ROWS = 24
+
+# Rows of a block of data, real parts first: Y, U; then of undriven bins one over the variance of Y, of driven
+# ones the variances of Y and U and their covariance.
+Y, U, INVERSE, VARIANCE_Y, VARIANCE_U, COVARIANCE = 0, 2, 4, 4, 5, 6
+PLANES = 8
 
 # What is linearised: the error, or ``A Y - B U - C`` over |A| or over 1 (Sanathanan-Koerner iterations).
 EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
@@ -101,9 +108,8 @@ class _Work(NamedTuple):
 
     Attributes
     ----------
-    y, u : (G, M, b, 2, BLOCK) float
-    noise : (G, b, 4, BLOCK) float
-        Undriven: one over the variance of Y. Driven: the variances of Y and U, their covariance.
+    values : (G, M, b, PLANES BLOCK) float
+        Data of blocks, the rows of each one after the other.
     rows, flat : (ROWS, BLOCK) and (ROWS BLOCK,) float
         Of a block, the same memory.
     power : (G, 2, b_undriven, BLOCK) float
@@ -117,14 +123,13 @@ class _Work(NamedTuple):
         `at` and at `trial`.
     cost, then : (G, 2) float
         Of undriven and driven bins at either.
-    systems : (M, n, n + 1) float
-    shared : (n - c, n - c + 1) float
-    step : (M, n) float
+    systems : (M, n, n + 1, G) float
+    shared : (n - c, n - c + 1, G) float
+    step : (M, n, G) float
+    fall : (G,) float
     """
 
-    y: FloatArray
-    u: FloatArray
-    noise: FloatArray
+    values: FloatArray
     rows: FloatArray
     flat: FloatArray
     power: FloatArray
@@ -138,6 +143,15 @@ class _Work(NamedTuple):
     systems: FloatArray
     shared: FloatArray
     step: FloatArray
+    fall: FloatArray
+
+
+@inner
+def _aligned(size):
+    """Zeros from a multiple of a cache line on, so that vectors as long as one are not read in two halves."""
+    memory = np.zeros(size + CACHE_LINE // 8)
+    first = -memory.ctypes.data % CACHE_LINE // 8
+    return memory[first : first + size]
 
 
 @inner
@@ -146,13 +160,12 @@ def _memory(tables, points, records):
     c, n = tables.c, tables.a + tables.b + tables.c
     undriven = tables.undriven.last.shape[0]
     blocks = undriven + tables.driven.last.shape[0]
-    flat, noise = np.zeros(ROWS * BLOCK), np.zeros((points, blocks, 4, BLOCK))
-    noise[:, :, 0] = 1.0  # of what blocks are filled up with
+    flat, size = _aligned(ROWS * BLOCK), points * records * blocks * PLANES * BLOCK
+    values = _aligned(size).reshape(points, records, blocks, PLANES * BLOCK)
+    values[..., INVERSE * BLOCK : (INVERSE + 1) * BLOCK] = 1.0  # of what blocks are filled up with
     size = n * (n + 1) + 1
     return _Work(
-        np.zeros((points, records, blocks, 2, BLOCK)),
-        np.zeros((points, records, blocks, 2, BLOCK)),
-        noise,
+        values,
         flat.reshape(ROWS, BLOCK),
         flat,
         np.zeros((points, 2, undriven, BLOCK)),
@@ -163,98 +176,95 @@ def _memory(tables, points, records):
         np.zeros((points, records, 2, size)),
         np.zeros((points, 2)),
         np.zeros((points, 2)),
-        np.empty((records, n, n + 1)),
-        np.empty((n - c, n - c + 1)),
-        np.empty((records, n)),
+        _aligned(records * n * (n + 1) * points).reshape(records, n, n + 1, points),
+        _aligned((n - c) * (n - c + 1) * points).reshape(n - c, n - c + 1, points),
+        _aligned(records * n * points).reshape(records, n, points),
+        np.zeros(points),
     )
 
 
 @inner
-def _load(data, point, g, to_y, to_u, power):
+def _load(data, point, values, power):
     """Bring a point into memory, and the power of its inputs. What blocks are filled up with adds nothing."""
-    y, u, order, undriven = data.y, data.u, data.order, data.undriven
-    before, same = -(-undriven // BLOCK), min(point, u.shape[0] - 1)
-    for block in range(to_y.shape[2]):
-        first, end = BLOCK * block, undriven
-        if block >= before:
-            first, end = undriven + BLOCK * (block - before), order.size
-        for m in range(y.shape[1]):
+    order, undriven, same = data.order, data.undriven, min(point, data.u.shape[0] - 1)
+    before = -(-undriven // BLOCK)
+    for m in range(values.shape[0]):
+        y, u = data.y[point, m], data.u[same, m]
+        for block in range(values.shape[1]):
+            of, first, end = values[m, block], BLOCK * block, undriven
+            if block >= before:
+                first, end = undriven + BLOCK * (block - before), order.size
             for k in range(min(BLOCK, end - first)):
                 place = np.uint64(order[first + k])  # without a sign: none counts from the end
-                of_y, of_u = y[point, m, place], u[same, m, place]
-                to_y[g, m, block, 0, k], to_y[g, m, block, 1, k] = of_y.real, of_y.imag
-                to_u[g, m, block, 0, k], to_u[g, m, block, 1, k] = of_u.real, of_u.imag
-    for block in range(before):
-        for k in range(BLOCK):
-            power[g, 1, block, k] = 0.0
-        for m in range(y.shape[1]):
-            for k in range(BLOCK):
-                re, im = to_u[g, m, block, 0, k], to_u[g, m, block, 1, k]
-                power[g, 1, block, k] += re * re + im * im
-
-
-@inner
-def _load_noise(data, point, g, noise):
-    """Bring the variances of a point into memory."""
-    rest, of_y, of_u, of_both = data.rest, data.variance_y, data.variance_u, data.covariance_yu
-    undriven, driven = data.undriven, data.order.size - data.undriven
-    before = -(-undriven // BLOCK)
-    if rest.shape[1] == 1:
-        inverse = 1 / rest[point, 0]
+                of[Y * BLOCK + k], of[(Y + 1) * BLOCK + k] = y[place].real, y[place].imag
+                of[U * BLOCK + k], of[(U + 1) * BLOCK + k] = u[place].real, u[place].imag
+        _load_noise(data, point, before, values[m])
+    power[:] = 0.0
+    for m in range(values.shape[0]):
         for block in range(before):
+            of, to = values[m, block], power[block]
             for k in range(BLOCK):
-                noise[g, block, 0, k] = inverse
-    else:
-        for k in range(undriven):
-            noise[g, k // BLOCK, 0, k % BLOCK] = 1 / rest[point, k]
-    for row, values in ((0, of_y), (1, of_u)):
-        if values.shape[1] == 1:
-            value = values[point, 0]
-            for block in range(before, noise.shape[1]):
-                for k in range(BLOCK):
-                    noise[g, block, row, k] = value
-        elif values.shape[1] > 1:
-            for k in range(driven):
-                noise[g, before + k // BLOCK, row, k % BLOCK] = values[point, k]
-    if of_both.shape[1] > 0:
-        for k in range(driven):
-            value = of_both[point, min(k, of_both.shape[1] - 1)]
-            noise[g, before + k // BLOCK, 2, k % BLOCK] = value.real
-            noise[g, before + k // BLOCK, 3, k % BLOCK] = value.imag
+                re, im = of[U * BLOCK + k], of[(U + 1) * BLOCK + k]
+                to[k] += re * re + im * im
 
 
 @inner
-def _combine(basis, row, place, block, theta, g, m, linear, flat):
+def _load_noise(data, point, before, values):
+    """Bring the variances of a point into memory."""
+    both = data.covariance_yu[point]
+    _fill(values[:before], INVERSE, 1 / data.rest[point], data.undriven)
+    driven = data.order.size - data.undriven
+    _fill(values[before:], VARIANCE_Y, data.variance_y[point], driven)
+    _fill(values[before:], VARIANCE_U, data.variance_u[point], driven)
+    if both.size > 0:
+        for k in range(driven):
+            at, value = k % BLOCK, both[min(k, both.size - 1)]
+            of = values[before + k // BLOCK]
+            of[COVARIANCE * BLOCK + at], of[(COVARIANCE + 1) * BLOCK + at] = value.real, value.imag
+
+
+@inner
+def _fill(values, row, entries, bins):
+    """A row of blocks, of entries for each of the bins, of one for all, or of none."""
+    if entries.size == 1:
+        for block in range(values.shape[0]):
+            for k in range(BLOCK):
+                values[block, row * BLOCK + k] = entries[0]
+    elif entries.size > 1:
+        for k in range(bins):
+            values[k // BLOCK, row * BLOCK + k % BLOCK] = entries[k]
+
+
+@inner
+def _combine(basis, row, place, theta, linear, flat):
     """A, B and C of a block; of a linear kind A alone."""
     for i in range(row.size):
-        to = row[i]
-        first, second = theta[g, m, place[i, 0]], theta[g, m, place[i, 1]]
-        if to >= 0:
-            if not (linear and to >= ROW_B):
-                for k in range(BLOCK):
-                    flat[to * BLOCK + k] += (
-                        first * basis[block, i, 0, k] + second * basis[block, i, 1, k]
-                    )
-        else:
+        to, more = row[i], row[i] >= 0
+        if not more:
             to = -1 - to
-            if not (linear and to >= ROW_B):
-                for k in range(BLOCK):
-                    flat[to * BLOCK + k] = (
-                        first * basis[block, i, 0, k] + second * basis[block, i, 1, k]
-                    )
+        if linear and to >= ROW_B:
+            continue
+        first, second, of = theta[place[i, 0]], theta[place[i, 1]], basis[i]
+        to *= BLOCK
+        if more:
+            for k in range(BLOCK):
+                flat[to + k] += first * of[k] + second * of[BLOCK + k]
+        else:
+            for k in range(BLOCK):
+                flat[to + k] = first * of[k] + second * of[BLOCK + k]
 
 
 @inner
-def _weigh_linear(y, u, noise, g, m, at, last, block, driven, weighted, flat):
+def _weigh_linear(of, last, driven, weighted, flat):
     """Weights of ``A Y - B U - C`` over ``|A|``, or over 1, with the derivatives at 0."""
     for k in range(BLOCK):
-        w = 1 / noise[g, at, 0, k] if driven else noise[g, at, 0, k]
+        w = 1 / of[VARIANCE_Y * BLOCK + k] if driven else of[INVERSE * BLOCK + k]
         if weighted:
             re, im = flat[ROW_A * BLOCK + k], flat[(ROW_A + 1) * BLOCK + k]
             w /= re * re + im * im
-        l_re, l_im = last[block, 0, k], -last[block, 1, k]
-        y_re, y_im = y[g, m, at, 0, k], y[g, m, at, 1, k]
-        u_re, u_im = u[g, m, at, 0, k], u[g, m, at, 1, k]
+        l_re, l_im = last[k], -last[BLOCK + k]
+        y_re, y_im = of[Y * BLOCK + k], of[(Y + 1) * BLOCK + k]
+        u_re, u_im = of[U * BLOCK + k], of[(U + 1) * BLOCK + k]
         squared, x_re, x_im = w * (y_re * y_re + y_im * y_im), -w * y_re, w * y_im
         z_re, z_im = x_re * l_re - x_im * l_im, x_re * l_im + x_im * l_re
         flat[ROW_AA * BLOCK + k] = squared
@@ -272,22 +282,22 @@ def _weigh_linear(y, u, noise, g, m, at, last, block, driven, weighted, flat):
 
 
 @inner
-def _weigh_undriven(y, u, noise, g, m, at, flat, power, cross):
-    """Weights of a block of undriven bins; its cost. The power of its errors is added, see `_Work`."""
+def _weigh_undriven(of, flat):
+    """Weights of undriven bins, and the power of their errors; their cost, and sum of ``error conj(u)``."""
     cost = both_re = both_im = 0.0
     for k in range(BLOCK):
         re, im = flat[ROW_A * BLOCK + k], flat[(ROW_A + 1) * BLOCK + k]
         c_re, c_im = flat[ROW_C * BLOCK + k], flat[(ROW_C + 1) * BLOCK + k]
-        u_re, u_im = u[g, m, at, 0, k], u[g, m, at, 1, k]
+        u_re, u_im = of[U * BLOCK + k], of[(U + 1) * BLOCK + k]
         squared = 1 / (re * re + im * im)
         m_re, m_im = squared * (c_re * re + c_im * im), squared * (c_im * re - c_re * im)
-        e_re, e_im = y[g, m, at, 0, k] - m_re, y[g, m, at, 1, k] - m_im
-        v = noise[g, at, 0, k]
+        e_re, e_im = of[Y * BLOCK + k] - m_re, of[(Y + 1) * BLOCK + k] - m_im
+        v = of[INVERSE * BLOCK + k]
         w = v * squared
         z_re, z_im = w * (e_re * re - e_im * im), -w * (e_re * im + e_im * re)
         own = e_re * e_re + e_im * e_im
         cost += v * own
-        power[g, 0, at, k] += own
+        flat[ROW_POWER * BLOCK + k] = own
         both_re += e_re * u_re + e_im * u_im
         both_im += e_im * u_re - e_re * u_im
         flat[ROW_AA * BLOCK + k] = w * (m_re * m_re + m_im * m_im)
@@ -296,13 +306,11 @@ def _weigh_undriven(y, u, noise, g, m, at, flat, power, cross):
         flat[ROW_OF_A * BLOCK + k] = z_re * m_re - z_im * m_im
         flat[(ROW_OF_A + 1) * BLOCK + k] = z_re * m_im + z_im * m_re
         flat[ROW_OF_C * BLOCK + k], flat[(ROW_OF_C + 1) * BLOCK + k] = -z_re, -z_im
-    cross[g, 0] += both_re
-    cross[g, 1] += both_im
-    return cost
+    return cost, both_re, both_im
 
 
 @inner
-def _weigh_driven(y, u, noise, g, m, at, flat):
+def _weigh_driven(of, flat):
     """Errors and weights of a block of driven bins; its cost.
 
     The variance of the error depends on the response: the gradient has its derivative too.
@@ -314,15 +322,16 @@ def _weigh_driven(y, u, noise, g, m, at, flat):
         i_re, i_im = re * squared, -im * squared
         b_re, b_im = flat[ROW_B * BLOCK + k], flat[(ROW_B + 1) * BLOCK + k]
         g_re, g_im = b_re * i_re - b_im * i_im, b_re * i_im + b_im * i_re
-        u_re, u_im = u[g, m, at, 0, k], u[g, m, at, 1, k]
+        u_re, u_im = of[U * BLOCK + k], of[(U + 1) * BLOCK + k]
         c_re, c_im = flat[ROW_C * BLOCK + k], flat[(ROW_C + 1) * BLOCK + k]
         m_re = c_re * i_re - c_im * i_im + g_re * u_re - g_im * u_im
         m_im = c_re * i_im + c_im * i_re + g_re * u_im + g_im * u_re
-        e_re, e_im = y[g, m, at, 0, k] - m_re, y[g, m, at, 1, k] - m_im
-        of_u, s_re, s_im = noise[g, at, 1, k], noise[g, at, 2, k], noise[g, at, 3, k]
+        e_re, e_im = of[Y * BLOCK + k] - m_re, of[(Y + 1) * BLOCK + k] - m_im
+        of_u = of[VARIANCE_U * BLOCK + k]
+        s_re, s_im = of[COVARIANCE * BLOCK + k], of[(COVARIANCE + 1) * BLOCK + k]
         # half the derivative of the variance by g
         d_re, d_im = of_u * g_re - s_re, s_im - of_u * g_im
-        v = 1 / (noise[g, at, 0, k] + (d_re - s_re) * g_re - (d_im + s_im) * g_im)
+        v = 1 / (of[VARIANCE_Y * BLOCK + k] + (d_re - s_re) * g_re - (d_im + s_im) * g_im)
         power = v * (e_re * e_re + e_im * e_im)
         cost += power
         w = v * squared
@@ -348,17 +357,17 @@ def _weigh_driven(y, u, noise, g, m, at, flat):
 
 
 @inner
-def _add_up(products, weight, target, block, rows, gram, g, m, part):
+def _add_up(products, weight, target, rows, gram):
     """Add the normal matrix and half the gradient of a block."""
     for pair in range(weight.size):
-        row = weight[pair]
+        row, of = weight[pair], products[pair]
         first = second = 0.0
         for k in range(BLOCK):
             w = rows[row, k]
-            first += products[block, pair, 0, k] * w
-            second += products[block, pair, 1, k] * w
-        gram[g, m, part, target[pair, 0]] += first
-        gram[g, m, part, target[pair, 1]] += second
+            first += of[k] * w
+            second += of[BLOCK + k] * w
+        gram[target[pair, 0]] += first
+        gram[target[pair, 1]] += second
 
 
 @inner
@@ -366,8 +375,7 @@ def _sums(tables, part, work, which, theta, kind, gram, cost):
     """Normal matrices, half the gradients and costs of undriven (0) or driven bins (1), of some points."""
     bins = tables.driven if part else tables.undriven
     _, last, basis, row, place, products, weight, target = bins
-    y, u, noise, rows, flat = work.y, work.u, work.noise, work.rows, work.flat
-    power, cross = work.power, work.cross
+    rows, flat, power, cross = work.rows, work.flat, work.power, work.cross
     records, before = theta.shape[1], tables.undriven.last.shape[0] if part else 0
     for g in which:
         cost[g, part] = 0.0
@@ -375,77 +383,97 @@ def _sums(tables, part, work, which, theta, kind, gram, cost):
         power[g, 0] = 0.0
         cross[g] = 0.0
     for block in range(last.shape[0]):
-        at = before + block
         for g in which:
             for m in range(records):
+                of = work.values[g, m, before + block]
                 if kind != LINEAR_UNWEIGHTED:
-                    _combine(basis, row, place, block, theta, g, m, kind == LINEAR, flat)
+                    _combine(basis[block], row, place, theta[g, m], kind == LINEAR, flat)
                 if kind != EXACT:
-                    _weigh_linear(
-                        y, u, noise, g, m, at, last, block, part == 1, kind == LINEAR, flat
-                    )
+                    _weigh_linear(of, last[block], part == 1, kind == LINEAR, flat)
                 elif part:
-                    cost[g, 1] += _weigh_driven(y, u, noise, g, m, at, flat)
+                    cost[g, 1] += _weigh_driven(of, flat)
                 else:
-                    cost[g, 0] += _weigh_undriven(y, u, noise, g, m, at, flat, power, cross)
-                _add_up(products, weight, target, block, rows, gram, g, m, part)
+                    more, both_re, both_im = _weigh_undriven(of, flat)
+                    cost[g, 0] += more
+                    cross[g, 0] += both_re
+                    cross[g, 1] += both_im
+                    to = power[g, 0, block]
+                    for k in range(BLOCK):
+                        to[k] += flat[ROW_POWER * BLOCK + k]
+                _add_up(products[block], weight, target, rows, gram[g, m, part])
 
 
 @inner
-def _solve(gram, g, c, n, damping, systems, total, step):
-    """Solve the normal equations of a point; the step's decrement of the cost, NaN without a step.
+def _eliminate(system, count):
+    """Eliminate the first unknowns from the equations below, of points side by side.
+
+    Pivots become their inverses, NaN where one is not above 0.
+    """
+    rows, width, points = system.shape
+    for i in range(count):
+        pivot = system[i, i]
+        for g in range(points):
+            pivot[g] = 1 / pivot[g] if pivot[g] > 0 else np.nan
+        for j in range(i + 1, rows):
+            of = system[i, j]
+            for k in range(j, width):
+                other, to = system[i, k], system[j, k]
+                for g in range(points):
+                    to[g] -= of[g] * pivot[g] * other[g]
+
+
+@inner
+def _substitute(system, count, first, step):
+    """Solve the first `count` equations that are left of a `system`, whose unknowns begin at `first`."""
+    _, width, points = system.shape
+    for i in range(count - 1, -1, -1):
+        to, right, pivot = step[first + i], system[i, width - 1], system[i, i]
+        for g in range(points):
+            to[g] = right[g]
+        for j in range(i + 1, width - 1):
+            of, known = system[i, j], step[first + j]
+            for g in range(points):
+                to[g] -= of[g] * known[g]
+        for g in range(points):
+            to[g] *= pivot[g]
+
+
+@inner
+def _solve(work, which, c, damping):
+    """Solve the normal equations of some points side by side; steps NaN where they are singular.
 
     Own coefficients of each record are eliminated first: the cost of a step grows as M, not as its cube
     (Golub & Van Loan, *Matrix Computations*, 4th ed. (2013), section 3.2.11). Without pivoting, whose
-    rounding is that of Cholesky's method whatever the scales of the unknowns. Memory is that of `_Work`.
+    rounding is that of Cholesky's method whatever the scales of the unknowns. Written are steps and their
+    decrements of the cost.
     """
-    records, shared, width = gram.shape[1], n - c, n + 1
-    for i in range(shared):
-        for j in range(shared + 1):
-            total[i, j] = 0.0
-    more = 1 + 1e-15 + damping
+    gram, systems, total, step, fall = work.gram, work.systems, work.shared, work.step, work.fall
+    (records, n, points), shared, width = step.shape, total.shape[0], total.shape[1] + c
+    total[:] = 0.0
     for m in range(records):
-        for i in range(n):
-            for j in range(i, width):
-                systems[m, i, j] = gram[g, m, 0, i * width + j] + gram[g, m, 1, i * width + j]
-            systems[m, i, i] *= more
-        for i in range(c):
-            if not systems[m, i, i] > 0:
-                return np.nan
-            inverse = 1 / systems[m, i, i]
-            for j in range(i + 1, n):
-                factor = systems[m, i, j] * inverse
-                for k in range(j, width):
-                    systems[m, j, k] -= factor * systems[m, i, k]
+        system = systems[m]
+        for g in which:
+            first, second = gram[g, m, 0], gram[g, m, 1]
+            for i in range(n):
+                for j in range(i, width):
+                    system[i, j, g] = first[i * width + j] + second[i * width + j]
+                system[i, i, g] *= 1 + 1e-15 + damping[g]
+        _eliminate(system, c)
         for i in range(shared):
             for j in range(i, shared + 1):
-                total[i, j] += systems[m, c + i, c + j]
-    for i in range(shared):
-        if not total[i, i] > 0:
-            return np.nan
-        inverse = 1 / total[i, i]
-        for j in range(i + 1, shared):
-            factor = total[i, j] * inverse
-            for k in range(j, shared + 1):
-                total[j, k] -= factor * total[i, k]
-    for i in range(shared - 1, -1, -1):
-        value = total[i, shared]
-        for j in range(i + 1, shared):
-            value -= total[i, j] * step[0, c + j]
-        step[0, c + i] = value / total[i, i]
-    decrement = 0.0
+                of, to = system[c + i, c + j], total[i, j]
+                for g in range(points):
+                    to[g] += of[g]
+    _eliminate(total, shared)
+    _substitute(total, shared, c, step[0])
+    fall[:] = 0.0
     for m in range(records):
-        for i in range(c, n):
-            step[m, i] = step[0, i]
-        for i in range(c - 1, -1, -1):
-            value = systems[m, i, n]
-            for j in range(i + 1, n):
-                value -= systems[m, i, j] * step[m, j]
-            step[m, i] = value / systems[m, i, i]
-        for i in range(n):
-            at = i * width + n
-            decrement += step[m, i] * (gram[g, m, 0, at] + gram[g, m, 1, at])
-    return decrement
+        step[m, c:] = step[0, c:]
+        _substitute(systems[m], c, 0, step[m])
+        for g in which:
+            for i in range(n):
+                at = i * width + n
+                fall[g] += step[m, i, g] * (gram[g, m, 0, at] + gram[g, m, 1, at])
 
 
 @inner
@@ -505,8 +533,7 @@ def moments(tables, data, theta):
     cost, gradient = np.empty((points, 2)), np.empty((points, records, n))
     normal = np.empty((points, records, 2, n, n))
     for point in range(points):
-        _load(data, point, 0, work.y, work.u, work.power)
-        _load_noise(data, point, 0, work.noise)
+        _load(data, point, work.values[0], work.power[0, 1])
         _inside(theta, point, c, work.at, 0)
         for part in range(2):
             _sums(tables, part, work, which, work.at, EXACT, work.gram, work.cost)
@@ -522,7 +549,7 @@ def moments(tables, data, theta):
 @inner
 def _start(tables, work, which):
     """Two Sanathanan-Koerner iterations; NaN where the equations are singular."""
-    c, n = tables.c, tables.a + tables.b + tables.c
+    undamped = np.zeros(work.fall.size)
     for kind in (LINEAR_UNWEIGHTED, LINEAR):
         if tables.from_driven:
             for g in which:
@@ -530,11 +557,12 @@ def _start(tables, work, which):
         else:
             _sums(tables, 0, work, which, work.at, kind, work.gram, work.cost)
         _sums(tables, 1, work, which, work.at, kind, work.gram, work.cost)
+        _solve(work, which, tables.c, undamped)
         for g in which:
-            found = np.isfinite(_solve(work.gram, g, c, n, 0.0, work.systems, work.shared, work.step))
+            found = np.isfinite(work.fall[g])
             for m in range(work.at.shape[1]):
-                for i in range(n):
-                    work.at[g, m, i] = -work.step[m, i] if found else np.nan
+                for i in range(work.step.shape[1]):
+                    work.at[g, m, i] = -work.step[m, i, g] if found else np.nan
 
 
 @inner
@@ -542,42 +570,44 @@ def _take(at, g, step, to):
     """Coefficients of a point less a step."""
     for m in range(step.shape[0]):
         for i in range(step.shape[1]):
-            to[g, m, i] = at[g, m, i] - step[m, i]
+            to[g, m, i] = at[g, m, i] - step[m, i, g]
 
 
 @inner
-def _weight_with(noise, gram, cost, g, before, variance_y, variance_u):
+def _weight_with(values, gram, cost, g, before, variance_y, variance_u):
     """Flat variances, in memory and in what sums there are of undriven bins."""
     factor = 1 / variance_y
-    change = factor / noise[g, 0, 0, 0]
+    change = factor / values[g, 0, 0, INVERSE * BLOCK]
     for m in range(gram.shape[1]):
         for i in range(gram.shape[3]):
             gram[g, m, 0, i] *= change
     cost[g, 0] *= change
-    for block in range(noise.shape[1]):
-        value = factor if block < before else variance_y
-        for k in range(BLOCK):
-            noise[g, block, 0, k] = value
-    for block in range(before, noise.shape[1]):
-        for k in range(BLOCK):
-            noise[g, block, 1, k] = variance_u
+    for m in range(gram.shape[1]):
+        for block in range(values.shape[2]):
+            of, driven = values[g, m, block], block >= before
+            for k in range(BLOCK):
+                of[INVERSE * BLOCK + k] = variance_y if driven else factor
+            if driven:
+                for k in range(BLOCK):
+                    of[VARIANCE_U * BLOCK + k] = variance_u
 
 
 @inner
-def _are_flat(power, whole, bins, rules):
+def _are_flat(power, whole, bins, rules, sums):
     """Whether ``log mean - mean log`` of the power of pieces of the band passes the test."""
     if rules.pieces < FEWEST_PIECES or whole == 0:
         return True
+    size, last = rules.size, rules.pieces - 1
+    sums[: last + 1] = 0.0
+    for k in range(size):  # of all pieces at once: each is too short for a loop of its own
+        for piece in range(last + 1):
+            sums[piece] += power[piece * size + k]
+    for k in range(rules.pieces * size, bins):
+        sums[last] += power[k]
+    sums[last] *= size / (bins - last * size)
     total, logarithm, product = 0.0, 0.0, 1.0
-    unit = bins / (whole * rules.size)
     for piece in range(rules.pieces):
-        first, end = piece * rules.size, (piece + 1) * rules.size
-        if piece == rules.pieces - 1:
-            unit, end = bins / (whole * (bins - first)), bins
-        value = 0.0
-        for k in range(first, end):
-            value += power[k]
-        value *= unit
+        value = sums[piece] * (bins / (whole * size))
         total += value
         product *= value
         if not 1e-100 < product < 1e100:  # a logarithm costs as much as all else
@@ -596,16 +626,13 @@ def _from_noise(tables, work, which, rules, noise, plain, last_fall):
     `last_fall` (G,), what the step was expected to bring.
     """
     records, before = work.at.shape[1], tables.undriven.last.shape[0]
-    bins, c, n = tables.undriven.bins, tables.c, tables.a + tables.b + tables.c
-    values = records * bins
+    bins, c = tables.undriven.bins, tables.c
+    values, sums = records * bins, np.empty(rules.pieces)
     for last in (False, True):
         _sums(tables, 0, work, which, work.at, EXACT, work.gram, work.cost)
         for g in which:
-            of_error = of_u = 0.0
             error_power, u_power = work.power[g, 0].reshape(-1), work.power[g, 1].reshape(-1)
-            for k in range(error_power.size):
-                of_error += error_power[k]
-                of_u += u_power[k]
+            of_error, of_u = error_power.sum(), u_power.sum()
             if not np.isfinite(of_error):  # without start values nothing is known
                 of_error = of_u = 0.0
             common = work.cross[g, 0] ** 2 + work.cross[g, 1] ** 2
@@ -616,48 +643,48 @@ def _from_noise(tables, work, which, rules, noise, plain, last_fall):
                 noise[g, 0], noise[g, 1] = variance_y, variance_u
                 plain[g] = not alike and (
                     not of_error > 0
-                    or _are_flat(error_power, of_error, bins, rules)
-                    and _are_flat(u_power, of_u, bins, rules)
+                    or _are_flat(error_power, of_error, bins, rules, sums)
+                    and _are_flat(u_power, of_u, bins, rules, sums)
                 )
             elif alike:
                 variance_u = 0.0
             if not variance_y > TINY:  # no noise: any weights do
                 variance_y = 1.0
-            _weight_with(work.noise, work.gram, work.cost, g, before, variance_y, variance_u)
+            _weight_with(work.values, work.gram, work.cost, g, before, variance_y, variance_u)
         _sums(tables, 1, work, which, work.at, EXACT, work.gram, work.cost)
         if not last:
+            _solve(work, which, c, np.zeros(work.fall.size))
             for g in which:
-                fall = _solve(work.gram, g, c, n, 0.0, work.systems, work.shared, work.step)
-                if np.isfinite(fall):
+                if np.isfinite(work.fall[g]):
                     _take(work.at, g, work.step, work.at)
-                    last_fall[g] = fall
+                    last_fall[g] = work.fall[g]
 
 
 @inner
-def _weighted_power(y, noise, g, before):
+def _weighted_power(values, before):
     """``sum |Y|^2 / s_Y^2`` of a point."""
     total = 0.0
-    for m in range(y.shape[1]):
-        for block in range(y.shape[2]):
+    for m in range(values.shape[0]):
+        for block in range(values.shape[1]):
+            of, driven = values[m, block], block >= before
             for k in range(BLOCK):
-                re, im = y[g, m, block, 0, k], y[g, m, block, 1, k]
-                v = noise[g, block, 0, k]
-                total += (re * re + im * im) * (v if block < before else 1 / v)
+                re, im, v = of[Y * BLOCK + k], of[(Y + 1) * BLOCK + k], of[INVERSE * BLOCK + k]
+                total += (re * re + im * im) * (1 / v if driven else v)
     return total
 
 
 @inner
 def _expect(gram, g, step, cost):
     """Costs of undriven and driven bins after a step, as their sums here expect them."""
-    records, n = step.shape
+    records, n = step.shape[:2]
     for m in range(records):
         for part in range(2):
             change = 0.0
             for i in range(n):
-                row, moved = i * (n + 1), 0.5 * gram[g, m, part, i * (n + 1) + i] * step[m, i]
+                row, moved = i * (n + 1), 0.5 * gram[g, m, part, i * (n + 1) + i] * step[m, i, g]
                 for j in range(i + 1, n):
-                    moved += gram[g, m, part, row + j] * step[m, j]
-                change += step[m, i] * (moved - gram[g, m, part, row + n])
+                    moved += gram[g, m, part, row + j] * step[m, j, g]
+                change += step[m, i, g] * (moved - gram[g, m, part, row + n])
             cost[g, part] += 2 * change
 
 
@@ -671,22 +698,20 @@ def _descend(tables, work, which, rules, last_fall, total, converged):
     c, n = tables.c, tables.a + tables.b + tables.c
     records, bins = work.at.shape[1], tables.undriven.bins + tables.driven.bins
     tolerance = rules.tolerance**2 / max(records * (2 * bins - c) - (n - c), 1)
-    damping, floor = np.zeros(converged.size), np.zeros(converged.size)
+    damping, floor = np.zeros(work.fall.size), np.zeros(work.fall.size)
     for g in which:
         total[g], converged[g] = work.cost[g, 0] + work.cost[g, 1], False
-        floor[g] = rules.rounding**2 * _weighted_power(
-            work.y, work.noise, g, tables.undriven.last.shape[0]
-        )
+        power = _weighted_power(work.values[g], tables.undriven.last.shape[0])
+        floor[g] = rules.rounding**2 * power
     which = which.copy()
     count = which.size
     for _ in range(rules.iterations):
         left = 0
+        _solve(work, which[:count], c, damping)
         for g in which[:count]:
             if not np.isfinite(total[g]) or damping[g] > MOST_DAMPING:
                 continue
-            fall = _solve(
-                work.gram, g, c, n, damping[g], work.systems, work.shared, work.step
-            )
+            fall = work.fall[g]
             if damping[g] == 0 and (
                 fall <= max(tolerance * total[g], floor[g])
                 or fall * fall <= SURELY**2 * tolerance * total[g] * last_fall[g]
@@ -722,16 +747,16 @@ def _descend(tables, work, which, rules, last_fall, total, converged):
 def _residuals(tables, work, which, first, residual):
     """Weighted errors of driven bins, turned by the phase of the input, into (points, M, K_driven)."""
     _, last, basis, row, place, _, _, _ = tables.driven
-    y, u, noise, flat = work.y, work.u, work.noise, work.flat
-    before, bins = tables.undriven.last.shape[0], tables.driven.bins
+    flat, before, bins = work.flat, tables.undriven.last.shape[0], tables.driven.bins
     for block in range(last.shape[0]):
-        at, size = before + block, min(BLOCK, bins - BLOCK * block)
+        begin = BLOCK * block
         for g in which:
-            for m in range(y.shape[1]):
-                _combine(basis, row, place, block, work.at, g, m, False, flat)
-                _weigh_driven(y, u, noise, g, m, at, flat)
+            for m in range(residual.shape[1]):
+                of, to = work.values[g, m, before + block], residual[first + g, m]
+                _combine(basis[block], row, place, work.at[g, m], False, flat)
+                _weigh_driven(of, flat)
                 for k in range(BLOCK):
-                    re, im = u[g, m, at, 0, k], u[g, m, at, 1, k]
+                    re, im = of[U * BLOCK + k], of[(U + 1) * BLOCK + k]
                     e_re, e_im = flat[ROW_E * BLOCK + k], flat[(ROW_E + 1) * BLOCK + k]
                     squared = re * re + im * im
                     nothing = not squared > 0
@@ -739,10 +764,8 @@ def _residuals(tables, work, which, first, residual):
                     scale = np.sqrt(flat[ROW_V * BLOCK + k] / squared)
                     flat[ROW_AC * BLOCK + k] = scale * (e_re * re + e_im * im)
                     flat[(ROW_AC + 1) * BLOCK + k] = scale * (e_im * re - e_re * im)
-                for k in range(size):
-                    residual[first + g, m, BLOCK * block + k] = complex(
-                        flat[ROW_AC * BLOCK + k], flat[(ROW_AC + 1) * BLOCK + k]
-                    )
+                for k in range(min(BLOCK, bins - begin)):
+                    to[begin + k] = complex(flat[ROW_AC * BLOCK + k], flat[(ROW_AC + 1) * BLOCK + k])
 
 
 @inner
@@ -891,8 +914,7 @@ def minimise(tables, data, start, rules):
         here, which = slice(first, first + count), np.arange(count)
         last_fall[:] = 0.0
         for g in range(count):
-            _load(data, first + g, g, work.y, work.u, work.power)
-            _load_noise(data, first + g, g, work.noise)
+            _load(data, first + g, work.values[g], work.power[g, 1])
             if start.shape[0] > 0:
                 _inside(start, first + g, c, work.at, g)
         if start.shape[0] == 0:

@@ -49,16 +49,16 @@ class Part(NamedTuple):
     Attributes
     ----------
     bins : int
-    last : (blocks, 2, BLOCK) float
+    last : (blocks, 2 BLOCK) float
         Polynomial of A whose coefficient is 1: real and imaginary part.
-    basis : (blocks, pairs, 2, BLOCK) float
+    basis : (blocks, pairs, 2 BLOCK) float
         Real or imaginary parts of basis functions, those that are not 0 throughout: of polynomials of an
         imaginary variable every second one is. In pairs that add to the same row of the memory.
     row : (pairs,) int
         That row; less one and with a minus where nothing is there yet.
     place : (pairs, 2) int
         Which coefficient each belongs to, in the order C, A, B and 1.
-    products : (blocks, pairs, 2, BLOCK) float
+    products : (blocks, pairs, 2 BLOCK) float
         Products of basis functions, real or imaginary parts, in pairs with the same weight.
     weight : (pairs,) int
         Its row in the memory.
@@ -124,7 +124,7 @@ class Part(NamedTuple):
         ]
         return cls(
             bins,
-            _blocks([last.real, last.imag], blocks),
+            _blocks([last.real, last.imag], blocks).reshape(blocks, 2 * BLOCK),
             _paired([pair for _, *pair in added], blocks),
             *_numbers(added),
             _paired([pair for _, *pair in pairs], blocks),
@@ -133,9 +133,9 @@ class Part(NamedTuple):
 
 
 def _paired(pairs: list[list[tuple[FloatArray, int]]], blocks: int) -> FloatArray:
-    """(blocks, pairs, 2, BLOCK)."""
+    """(blocks, pairs, 2 BLOCK)."""
     rows = _blocks([values for pair in pairs for values, _ in pair], blocks)
-    return rows.reshape(blocks, len(pairs), 2, BLOCK)
+    return rows.reshape(blocks, len(pairs), 2 * BLOCK)
 
 
 def _numbers(pairs: list[tuple]) -> tuple[IntArray, IntArray]:
