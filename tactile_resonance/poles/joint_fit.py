@@ -107,11 +107,11 @@ class _Round:
     @property
     def lines(self) -> IntArray:
         """(batch,) excited lines; 0 of points of which a bin is not finite."""
-        usable = np.isfinite(self.solution.cost)
-        for k in np.flatnonzero(~usable):
+        lines = np.full(self.kind.size, self.plan.excited_at.size)
+        for k in np.flatnonzero(~np.isfinite(self.solution.cost)):
             y, u = self.plain.y[k], self.plain.u[k]
-            usable[k] = bool(np.isfinite(y).all() and np.isfinite(u).all())
-        return np.where(usable, self.plan.excited_at.size, 0)
+            lines[k] *= bool(np.isfinite(y).all() and np.isfinite(u).all())
+        return lines
 
     @cached_property
     def response(self) -> ComplexArray:
@@ -180,10 +180,12 @@ def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
     judged = _fit(plan, u, y)
     doubtful = np.full(len(y), _returns(plan, y.shape[1]))
     for _ in range(MOST_RETURNS):
-        doubtful &= (judged.suspect | (judged.kind != 0)) & _may_return(judged)
-        if not doubtful.any():
-            break
+        doubtful &= judged.suspect | (judged.kind != 0)
+        if doubtful.any():
+            doubtful &= _may_return(judged)
         rows = np.flatnonzero(doubtful)
+        if not rows.size:
+            break
         before = judged.noise_variance[rows, 0]
         judged.put(rows, _fit(plan, u[rows], y[rows], judged.theta[rows, None]))
         doubtful[rows] &= np.abs(judged.noise_variance[rows, 0] - before) > SAME_LEVEL * before
@@ -239,7 +241,7 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     theta, inverse = solution.theta[:, 0], solution.marginal[:, 0]
     batch = len(theta)
     level = Level.of(plan, solution, fitted.noise, fitted.kind == 2)
-    residual = solution.residual[:, 0] / np.sqrt(level.scale)[:, None]
+    residual = solution.residual[:, 0] * (1 / np.sqrt(level.scale))[:, None]
     suspect = are_smooth(residual, plan.structure.parameters) | level.suspect
     lacking = np.full((batch, 3), np.nan)
     asked = _may_return(solution)

@@ -241,8 +241,7 @@ def _lost_to_rounding(covariance: FloatArray) -> BoolArray:
 
     A mode beside its own zero leaves the normal matrix all but singular.
     """
-    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
-    return np.asarray((variances <= 0).any(axis=(-2, -1)))
+    return np.asarray(((covariance[..., 0, 0] <= 0) | (covariance[..., 1, 1] <= 0)).any(axis=-1))
 
 
 def _needed(

@@ -153,17 +153,18 @@ def lacking_terms(
     directions = plan.directions
     dof = data.undriven + data.driven - theta.shape[1] / 2
     fall = _falls(data, plan.driven_bases, theta, inverse, directions.numerator, directions.modes)
-    chance = (dof - 1) * np.log1p(-fall / cost[:, None])
-    chance[:, 1:] += np.log(max(directions.poles_rad_s.size, 1))
-    chance[np.isnan(chance)] = 0.0
-    best = np.argmin(chance, axis=1)
-    found = np.full((best.size, 3), np.nan)
-    for k in np.flatnonzero(chance.min(axis=1) < np.log(FALSE_ALARM)):
-        least = fall[k, best[k]]
-        found[k, 0] = 2 * least * (dof - 1) / (cost[k] - least)
-        found[k, 1] = 2.0 if best[k] == 0 else 4.0
-        if best[k] > 0:
-            found[k, 2] = np.abs(directions.poles_rad_s[best[k] - 1]) / (2 * np.pi)
+    found = np.full((len(fall), 3), np.nan)
+    least = 1 - FALSE_ALARM ** (1 / max(dof - 1, 0.5))  # of the cost: chance makes it fall by less
+    for k in np.flatnonzero((fall > least * cost[:, None]).any(axis=1)):
+        chance = (dof - 1) * np.log1p(-fall[k] / cost[k])
+        chance[1:] += np.log(max(directions.poles_rad_s.size, 1))
+        chance[np.isnan(chance)] = 0.0
+        best = np.argmin(chance)
+        if chance[best] < np.log(FALSE_ALARM):
+            found[k, 0] = 2 * fall[k, best] * (dof - 1) / (cost[k] - fall[k, best])
+            found[k, 1] = 2.0 if best == 0 else 4.0
+            if best > 0:
+                found[k, 2] = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi)
     return found
 
 

@@ -32,18 +32,29 @@ def modes_in_band(poles_rad_s: ComplexArray, band_hz: tuple[float, float]) -> Co
     (..., n // 2) complex
         NaN from the last mode on.
     """
-    places = poles_rad_s.shape[-1] // 2
     margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
-    f0_hz = np.abs(poles_rad_s) / (2 * np.pi)
-    inside = (
-        (poles_rad_s.imag > 0) & (f0_hz >= band_hz[0] - margin) & (f0_hz <= band_hz[1] + margin)
-    )
-    if poles_rad_s.shape[-1] == 2:
-        first = inside[..., :1]
-        taken = np.where(first, poles_rad_s[..., :1], poles_rad_s[..., 1:])
-        return np.where(first | inside[..., 1:], taken, np.nan)
-    order = np.argsort(np.where(inside, f0_hz, np.inf), axis=-1)[..., :places]
-    return np.take_along_axis(np.where(inside, poles_rad_s, np.nan), order, axis=-1)
+    n = poles_rad_s.shape[-1]
+    poles = _in_band(poles_rad_s.reshape(-1, n), band_hz[0] - margin, band_hz[1] + margin)
+    return poles.reshape(*poles_rad_s.shape[:-1], n // 2)
+
+
+@entry
+def _in_band(poles, low_hz, high_hz):
+    """(points, n // 2) of poles (points, n) those above the real axis in a band, by natural frequency."""
+    points, n = poles.shape
+    found, f0_hz = np.full((points, n // 2), complex(np.nan, np.nan)), np.empty(n // 2)
+    for point in range(points):
+        count = 0
+        for pole in poles[point]:
+            size_hz = np.abs(pole) / (2 * np.pi)
+            if pole.imag > 0 and low_hz <= size_hz <= high_hz and count < n // 2:
+                k = count
+                while k > 0 and f0_hz[k - 1] > size_hz:
+                    f0_hz[k], found[point, k] = f0_hz[k - 1], found[point, k - 1]
+                    k -= 1
+                f0_hz[k], found[point, k] = size_hz, pole
+                count += 1
+    return found
 
 
 def real_covariance(sensitivity: ComplexArray, parameters: FloatArray) -> FloatArray:
@@ -124,6 +135,7 @@ def _propagated(poles, sensitivity, parameters):
 def _propagate_a_little() -> None:
     one = np.ones((1, 1))
     _propagated(one + 0j, one[..., None] + 0j, one[..., None])
+    _in_band(one + 0j, 0.0, 1.0)
 
 
 def pole_quantities(

@@ -143,9 +143,10 @@ def is_rare(
     dof, other_dof : (batch,) float
         Complex degrees of freedom of the first and of the second.
     probability : float
-        Well below that of a ratio of 1.
+        Below a hundredth.
     """
-    rare = np.asarray(ratio > 1)
+    # within two deviations of 1 chance is not below that
+    rare = np.asarray(ratio > 1 + 2 * np.sqrt(1 / dof + 1 / other_dof))
     rows = np.flatnonzero(rare)
     if rows.size:  # others need no special function
         chance = special.fdtrc(2 * dof[rows], 2 * other_dof[rows], ratio[rows])

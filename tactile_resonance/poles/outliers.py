@@ -173,16 +173,16 @@ def _most_striking(batch: PolesBatch, frf: FRF) -> int | None:
     fit, used = batch.fit, np.isfinite(frf.g)
     variance = np.ones(used.size) if frf.variance is None else frf.variance
     used &= np.isfinite(variance) & (variance > 0)
-    response = fit.response(frf.frequency_hz)
-    if not np.isfinite(response).all() or used.sum() <= batch.structure.fewest_lines:
-        return None
     x = fit.variable.of_frequency(frf.frequency_hz)
     p, q = (basis.at(x, 0)[0] for basis in (fit.denominator_basis, fit.numerator_basis))
+    turned = np.exp(-2j * np.pi * frf.frequency_hz * fit.delay_s) / (p @ fit.denominator)
+    response = (q @ fit.numerator) * turned
+    if not np.isfinite(response).all() or used.sum() <= batch.structure.fewest_lines:
+        return None
     smooth = median_filter(np.where(used, variance, np.median(variance[used])), ALIKE_LINES)
     by_line = str(batch.variance_model) == "per line"
     weight = used / np.sqrt(np.where(used, variance, 1.0) if by_line else smooth)
-    delay = np.exp(-2j * np.pi * frf.frequency_hz * fit.delay_s)
-    scale = weight * delay / (p @ fit.denominator)
+    scale = weight * turned
     error = np.asarray(np.where(used, frf.g - response, 0) * weight, complex)[None]
     bases = p, q, np.empty((used.size, 0), complex)
     none = np.zeros_like(used)

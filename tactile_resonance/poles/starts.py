@@ -89,12 +89,11 @@ def _split_starts(
     shared, records = sum(plan.problem.sizes[:2]), data.records
     model = plan.model_of(theta[:, 0])
     start = np.full(theta.shape, np.nan)
-    for k, of_point in enumerate(model.poles_rad_s()):  # (a,)
-        above = of_point[of_point.imag > 0]
-        if above.size < 2:
-            continue
-        height = np.abs(model.at((k,)).residues(above)) / np.abs(above.real)
-        if not np.isfinite(height).all():
+    poles_of_all = model.poles_rad_s()  # (points, a)
+    heights = np.abs(model.residues(poles_of_all)) / np.abs(poles_of_all.real)
+    for k, of_point in enumerate(poles_of_all):
+        above, height = (values[of_point.imag > 0] for values in (of_point, heights[k]))
+        if above.size < 2 or not np.isfinite(height).all():
             continue
         highest, least = above[np.argmax(height)], above[np.argmin(height)]
         step = 1j * APART * abs(highest.real)

@@ -27,7 +27,7 @@ MOST_COMPONENTS = 128
 
 @lru_cache(maxsize=64)
 def components(lines: int, parameters: int) -> tuple[IntArray, FloatArray]:
-    """(levels,) how many cosine coefficients are compared with the rest, and (F, J) the cosines.
+    """(levels,) how many cosine coefficients are compared with the rest, and (J, F) the cosines.
 
     The fit has taken its own parameters out of the smooth ones, half a coefficient each, so the
     first level has as many as there are parameters; each further one twice those of the last, up to
@@ -37,7 +37,7 @@ def components(lines: int, parameters: int) -> tuple[IntArray, FloatArray]:
     levels = np.array([most])
     while levels[0] > 2 * parameters:
         levels = np.append(levels[0] // 2, levels)
-    line, k = np.ogrid[:lines, : -(-most // 8) * 8]  # as many as vectors hold
+    k, line = np.ogrid[:most, : -(-lines // 8) * 8]  # as many as vectors hold
     cosines = np.cos(np.pi * k * (line + 0.5) / lines) * np.sqrt(np.where(k == 0, 1, 2) / lines)
     return levels, cosines
 
@@ -100,25 +100,25 @@ def _best_level(residual: ComplexArray, parameters: int) -> tuple[FloatArray, in
 
 @entry
 def _scores(residual, counts, cosines):
-    """(points,) score of residuals (points, F) for numbers of cosines (levels,), of cosines (F, J)."""
+    """(points,) score of residuals (points, F) for numbers of cosines (levels,), of cosines (J, F)."""
     points, lines = residual.shape
-    most = cosines.shape[1]
-    re, im, scores = np.empty(most), np.empty(most), np.empty(points)
+    filled = cosines.shape[1]
+    re, im, scores = np.zeros(filled), np.zeros(filled), np.empty(points)
     for point in range(points):
         total, used = 0.0, 0
-        re[:] = 0.0
-        im[:] = 0.0
         for k in range(lines):
             x, y = residual[point, k].real, residual[point, k].imag
             total += x * x + y * y
             used += x != 0 or y != 0
-            for j in range(most):
-                re[j] += cosines[k, j] * x
-                im[j] += cosines[k, j] * y
+            re[k], im[k] = x, y
         smooth, best, first = 0.0, -np.inf, 0
         for count in counts:
             for j in range(first, count):
-                smooth += re[j] * re[j] + im[j] * im[j]
+                x = y = 0.0
+                for k in range(filled):
+                    x += cosines[j, k] * re[k]
+                    y += cosines[j, k] * im[k]
+                smooth += x * x + y * y
             first = count
             others = max(used - count, 1)
             root = (smooth / (total - smooth) * others / count) ** (1 / 3)
