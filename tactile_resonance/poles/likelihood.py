@@ -64,6 +64,8 @@ PLANES = 8
 EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
 
 TINY = float(np.finfo(float).tiny)
+MOST_INVERTED = 1 / float(np.finfo(float).eps)
+"""Condition of a matrix of which rounding leaves nothing of the inverse."""
 MOST_DAMPING = 1e10
 LEAST_DAMPING = 1e-3
 # A step is the last one, too, where the next one would be smaller than the tolerance by this factor, should
@@ -806,9 +808,11 @@ def _inverted(matrix, inverse, scale, row):
             value *= scale[i] * scale[j]
             inverse[i, j], inverse[j, i] = value, value
         good = good and inverse[i, i] > 0
-    if not good:
+    condition = np.sqrt(before * after)
+    if not (good and condition < MOST_INVERTED):
         inverse[:] = np.nan
-    return np.sqrt(np.sqrt(before * after)) if good else np.inf
+        return np.inf
+    return np.sqrt(condition)
 
 
 @entry
@@ -818,7 +822,7 @@ def invert(matrices):
     Returns
     -------
     inverse : (batch, n, n) float
-        NaN where a matrix is singular or not finite.
+        NaN where a matrix is singular to rounding, or not finite.
     condition : (batch,) float
         Root of the Frobenius condition number with unit diagonal: that of a Jacobian with unit columns,
         within a factor n. Infinite where there is no inverse.
