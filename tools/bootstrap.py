@@ -80,7 +80,7 @@ def set_up() -> None:
         packages.make(ros)
         write(PACKAGES_STAMP, packages_key)
     BUILD_STAMP.unlink(missing_ok=True)
-    build.build(anew=built.get("base") != build_key["base"])
+    build.build(anew=built.get("base") != build_key["base"], together=not ros)
     write(BUILD_STAMP, build_key)
     write(FITS_STAMP, fits_key)
 

@@ -68,8 +68,11 @@ def find_compiler(language: str) -> str:
     raise SetupError(f"no {language} compiler found ({looked_for}): apt install g++")
 
 
-def build(anew: bool) -> None:
-    """Compile the fits; build and install with colcon, `anew` from nothing, else on top of the last build."""
+def build(anew: bool, together: bool) -> None:
+    """Compile the fits; build and install with colcon, `anew` from nothing, else on top of the last build.
+
+    `together`: the sources of a message library in one compilation, of a ROS 2 that is known to allow it.
+    """
     if anew:
         shutil.rmtree(COLCON_BUILD, ignore_errors=True)
         shutil.rmtree(INSTALL, ignore_errors=True)
@@ -82,6 +85,7 @@ def build(anew: bool) -> None:
         # Python files are linked, so that what is edited in the source tree is what runs.
         layout = ["--merge-install", "--symlink-install"]
         cmake = ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"]
+        cmake.append(f"-DUNITY_MESSAGES={'ON' if together else 'OFF'}")
         failure = "the messages could not be built"
         run([*colcon, *layout, *cmake], "build.log", failure, _environment())
         trial = ["python", "-c", "from tactile_resonance.msg import FRF; FRF()"]
