@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_resonance._typing import ComplexArray, FloatArray
-from tactile_resonance.poles.compiled import entry, rehearsal
 from tactile_resonance.poles.structure import ModelStructure
 
 
@@ -100,7 +99,10 @@ class PolynomialBasis:
         m = coefficients.shape[-1] - 1
         h = self.hessenberg[:m, :m]
         if m == 2:  # an eigenvalue solver costs more than the fit
-            return _two_roots(coefficients.reshape(-1, 3), self.hessenberg).reshape(*coefficients.shape[:-1], 2)
+            # nodes that carry poles and fit none load no compiler
+            from tactile_resonance.poles.modes import two_roots
+
+            return two_roots(coefficients.reshape(-1, 3), self.hessenberg).reshape(*coefficients.shape[:-1], 2)
         last = self.hessenberg[m, m - 1] * coefficients[..., :m] / coefficients[..., m:]
         comrade = np.broadcast_to(h, (*last.shape[:-1], m, m)).copy()
         comrade[..., :, -1] -= last
@@ -109,31 +111,6 @@ class PolynomialBasis:
         roots = np.linalg.eigvals(comrade).astype(complex)
         roots[~finite] = np.nan
         return roots
-
-
-@entry
-def _two_roots(coefficients, h):
-    """(points, 2) roots of (points, 3) coefficients, in closed form; complex ones with that above first."""
-    roots = np.empty((coefficients.shape[0], 2), np.complex128)
-    for point in range(coefficients.shape[0]):
-        scale = h[2, 1] / coefficients[point, 2]
-        first, second = h[0, 0], h[1, 1] - scale * coefficients[point, 1]
-        beside = h[0, 1] - scale * coefficients[point, 0]
-        half, under = (first + second) / 2, ((first - second) / 2) ** 2 + beside * h[1, 0]
-        if under < 0:
-            root = np.sqrt(-under)
-            roots[point, 0], roots[point, 1] = complex(half, root), complex(half, -root)
-        else:
-            # the root of larger modulus first, the other from the product: no cancellation
-            large = half - np.sqrt(under) if half < 0 else half + np.sqrt(under)
-            roots[point, 0] = large
-            roots[point, 1] = 0.0 if large == 0 else (first * second - beside * h[1, 0]) / large
-    return roots
-
-
-@rehearsal
-def _find_two_roots() -> None:
-    _two_roots(np.ones((1, 3)), np.ones((3, 2)))
 
 
 def default_transient_terms(structure: ModelStructure) -> int:
