@@ -140,8 +140,9 @@ def test_the_poles_are_those_of_analyze(runs, tmp_path, capsys, order):
         assert float(row["damping_ratio_std"]) == pytest.approx(np.sqrt(best[1][1]), rel=2e-3)
         cross = best[0][1] / np.sqrt(best[0][0] * best[1][1])
         scale = float(row["f0_std_hz"]) * float(row["damping_ratio_std"])
-        # as far as variances within 4e-3: of four poles on one mode the total holds fits that end on their way
-        assert float(row["f0_damping_covariance_hz"]) / scale == pytest.approx(cross, abs=4e-3)
+        # four poles on the one mode of several realisations: rounding moves it by a thousandth or two
+        limit = 4e-3 if (order, row["index"]) == (4, "2") else 2e-3
+        assert float(row["f0_damping_covariance_hz"]) / scale == pytest.approx(cross, abs=limit)
         assert float(row["cost"]) == pytest.approx(found["cost"], rel=2e-3)
 
 
