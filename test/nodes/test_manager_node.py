@@ -94,3 +94,21 @@ def test_a_node_that_is_deactivated_and_cleaned_up_at_once_is_held(stack):
         assert stack.spin_until(lambda: managed.pending is None)
     assert stack.log == []
     assert managed.held
+
+
+def test_it_looks_seldom_once_all_are_up_and_often_while_one_is_not(stack, monkeypatch):
+    monkeypatch.setattr(manager_node, "QUIET_S", 7200.0)
+    often, seldom = 3600 * 10**9, 7200 * 10**9
+
+    def periods_ns():
+        return {timer.timer_period_ns for timer in stack.manager.timers}
+
+    assert often in periods_ns()
+    assert stack.bring_up(), stack.log
+    assert stack.spin_until(lambda: seldom in periods_ns())
+    assert often not in periods_ns()
+    node = stack.nodes["second"]
+    assert stack.spin_until(lambda: node.count_subscribers("second/transition_event") == 1)
+    node.trigger_deactivate()
+    assert stack.spin_until(lambda: often in periods_ns())
+    assert seldom not in periods_ns()
