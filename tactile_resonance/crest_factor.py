@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy.fft
 
 from tactile_resonance.multisine import Excitation
 
@@ -59,12 +58,12 @@ def compress_crest_factor(
     best, smallest = phasor, np.inf
     for clip in np.linspace(FIRST_CLIP, LAST_CLIP, passes):
         spectrum[lines] = 0.5 * amplitude * phasor
-        signal = scipy.fft.irfft(spectrum, n, norm="forward")
+        signal = np.fft.irfft(spectrum, n, norm="forward")
         peak = float(np.max(np.abs(signal)))
         if peak < smallest:
             best, smallest = phasor, peak
         np.clip(signal, -clip * peak, clip * peak, out=signal)
-        clipped = scipy.fft.rfft(signal)[lines]
+        clipped = np.fft.rfft(signal)[lines]
         size = np.abs(clipped)
         # a line that clipping removed keeps the phase it had
         phasor = np.where(size > 0, clipped / np.where(size > 0, size, 1.0), phasor)

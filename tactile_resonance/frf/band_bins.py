@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tactile_resonance._typing import ComplexArray, IntArray
-from tactile_resonance.frf.spectra import Spectrum
+if TYPE_CHECKING:
+    from tactile_resonance.frf.spectra import Spectrum
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,13 @@ def test_nodes_of_the_stream_load_no_statistics_figures_or_compiler():
     assert loaded_by(COMPILED).isdisjoint(set(HEAVY) - {"numba"})
 
 
+def test_what_only_plays_loads_no_scipy():
+    """Its first subpackage takes as long to import as all else of that node."""
+    found = loaded_by(("excitation_node",))
+    assert "tactile_resonance.multisine" in found
+    assert not [name for name in found if name.startswith("scipy.")]
+
+
 def test_nodes_of_the_hardware_load_nothing_of_the_simulation():
     found = loaded_by(HARDWARE)
     assert "tactile_resonance.sensor" in found
