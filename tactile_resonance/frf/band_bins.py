@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_resonance._typing import ComplexArray, IntArray
+
 if TYPE_CHECKING:
     from tactile_resonance.frf.spectra import Spectrum
 
