@@ -25,7 +25,7 @@ from benchmarks.calibrate_benches import (
 from benchmarks.skip_decision import PERCENT, PREPARATION_PERCENT, squared
 from benchmarks.skip_point import SimulatedPoint, pole_of
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.scan.decision import BlockLimits, Separate, Verdict, decide_tissue
+from tactile_resonance.scan.decision import BlockLimits, Separate, Verdict, decide
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import (
     ContactLoad,
@@ -113,7 +113,7 @@ def decide_point(task: tuple[int, int, int, float, bool]) -> Called:
         mode = estimator(contact_record(blocks, signal), stated_n, FORCE_STD_N)
         main = mode.poles.main
         contradicted |= mode.status.value != "ok"
-        decision = decide_tissue(main, pressed, nominal, len(blocks), asked, limits, block_s)
+        decision = decide(mode.poles, pressed, nominal, len(blocks), asked, limits, block_s)
         if decision.stop:
             break
     referred = refer_to_nominal(main.estimate, main.covariance, pressed, nominal)

@@ -27,8 +27,7 @@ from tactile_resonance.scan.decision import (
     Precise,
     Separate,
     Verdict,
-    decide_bands,
-    decide_tissue,
+    decide,
 )
 from tactile_resonance.scan.measurement import MeasurementDesign, excitation_of
 from tactile_resonance.scan.plan import make_plan
@@ -196,13 +195,8 @@ def measure(tissue: Tissue, case: Case, seed: int) -> Outcome:
         poles = poles_of_bands(frf.add(point.block(excitation), excitation), design.bands)
         blocks = round(point.time_s / design.block_s)
         pressed = ContactLoad(scene.force_n, FORCE_STD_N, age_s + point.time_s / 2)
-        mode, wanted = poles.main, case.wanted
-        if isinstance(wanted, Separate):
-            decision = decide_tissue(
-                mode, pressed, case.nominal, blocks, wanted, limits, design.block_s
-            )
-        else:
-            decision = decide_bands(poles, blocks, wanted, limits, design.block_s)
+        mode, asked = poles.main, (case.nominal, blocks, case.wanted, limits, design.block_s)
+        decision = decide(poles, pressed, *asked)
         if decision.stop:
             break
     error, nominal = mode.estimate - point.truth(), float("nan")

@@ -106,13 +106,12 @@ def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, int]:
     """Poles of one point measured block by block, and how many blocks that took."""
     from tactile_resonance.frf.measurement import MeasurementFrf
     from tactile_resonance.poles.estimator import poles_of_bands
-    from tactile_resonance.scan.decision import Separate, decide_bands, decide_tissue
+    from tactile_resonance.scan.decision import decide
     from tactile_resonance.scan.measurement import excitation_of
     from tactile_resonance.simulation.sensor.bench import SimulatedBench
     from tactile_resonance.tissue.nominal_contact import ContactLoad
 
     scene, design, frf, blocks = plan.scene, plan.measurement, MeasurementFrf(0), 0
-    wanted, limits = scene.precision, design.blocks
     pressed = ContactLoad(scene.force_n, 0.0, HELD_S)
     excitation = excitation_of(design, seed=1)
     bench = SimulatedBench.from_configuration()
@@ -120,14 +119,8 @@ def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, int]:
     for record in at_rest.play(excitation, excitation.periods):
         blocks += 1
         poles = poles_of_bands(frf.add(record, excitation), design.bands)
-        if isinstance(wanted, Separate):
-            nominal = scene.nominal_contact
-            decision = decide_tissue(
-                poles.main, pressed, nominal, blocks, wanted, limits, design.block_s
-            )
-        else:
-            decision = decide_bands(poles, blocks, wanted, limits, design.block_s)
-        if decision.stop:
+        wanted = scene.nominal_contact, blocks, scene.precision, design.blocks, design.block_s
+        if decide(poles, pressed, *wanted).stop:
             break
     return poles, blocks
 

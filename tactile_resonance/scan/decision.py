@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Enough? After each block: one more, or stop, and why."""
+"""Enough? After each block: one more, or stop; and which measurements count, where the force must be quiet."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.fields import check_above_zero, counted, require
-from tactile_resonance.poles.result import MainMode, Poles
+from tactile_resonance.fields import check_above_zero, check_within, require
+from tactile_resonance.poles.result import Poles
+from tactile_resonance.scan.hands import Measured, PointFailed
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
 from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
 
@@ -83,8 +84,6 @@ class Decision:
     Attributes
     ----------
     verdict : Verdict
-    reason : str
-        A sentence for people.
     blocks : int
         Measured so far.
     blocks_saved : int
@@ -96,7 +95,6 @@ class Decision:
     """
 
     verdict: Verdict
-    reason: str
     blocks: int
     blocks_saved: int = 0
     saved_s: float = 0.0
@@ -109,9 +107,9 @@ class Decision:
 
 
 def decide(
-    estimate: npt.ArrayLike,
-    covariance: npt.ArrayLike,
-    noise: npt.ArrayLike,
+    poles: Poles,
+    pressed: ContactLoad,
+    nominal: NominalContact | None,
     blocks: int,
     wanted: Precise | Separate | None,
     limits: BlockLimits,
@@ -119,12 +117,18 @@ def decide(
 ) -> Decision:
     """Whether the poles of all blocks so far are enough.
 
+    Two tissues are told apart by the main pole at the nominal contact. Otherwise the main modes of all bands
+    are to be as precise as wanted, and the first that is not decides: one for which more blocks are of use
+    comes before one for which they are not.
+
     Parameters
     ----------
-    estimate : (2,) float
-        f0 [Hz] and damping ratio from all blocks so far; NaN where there is none yet.
-    covariance, noise : (2, 2) float
-        Of the estimate, as of `Poles.main`: the best one known, and what of it is noise; NaN where unknown.
+    poles : Poles
+        Of all blocks so far, as measured.
+    pressed : ContactLoad
+        Force and age of the contact while they were.
+    nominal : NominalContact or None
+        To which the classes refer.
     blocks : int
         Measured so far, 1 or above.
     wanted : Precise, Separate or None
@@ -133,77 +137,51 @@ def decide(
     block_s : float
         Duration of one block [s].
     """
-    x, best, of_noise = (np.asarray(each, float) for each in (estimate, covariance, noise))
-    verdict, reason, called = Verdict.CONTINUE, "fewer blocks than required at least", ""
-    if blocks >= limits.least and wanted is not None:
-        if not (np.all(np.isfinite(best)) and np.all(np.isfinite(x))):
-            reason = "no pole with a covariance yet"
-        elif isinstance(wanted, Separate):
-            verdict, reason, called = _separated(x, best, of_noise, blocks, wanted, limits)
-        else:
-            verdict, reason = _precise(best, of_noise, blocks, wanted, limits)
-    elif wanted is None:
-        reason = "no precision requested"
-    if verdict is Verdict.CONTINUE and blocks >= limits.most:
-        verdict, reason = Verdict.MOST_BLOCKS, f"{counted(blocks, 'block')}; {reason}"
-    saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
-    return Decision(verdict, reason, blocks, saved, saved * block_s, called)
-
-
-def decide_bands(
-    poles: Poles,
-    blocks: int,
-    wanted: Precise | None,
-    limits: BlockLimits,
-    block_s: float,
-) -> Decision:
-    """Whether the main modes of all bands are as precise as wanted; the first that is not decides.
-
-    One for which more blocks are of use comes before one for which they are not.
-
-    Parameters
-    ----------
-    poles : Poles
-        Of all blocks so far.
-    blocks, wanted, limits, block_s
-        As `decide`.
-    """
+    if isinstance(wanted, Separate):
+        mode = poles.main
+        at = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
+        noise = mode.noise if np.all(np.isfinite(mode.noise)) else mode.covariance
+        return decide_mode(at.compared, at.covariance, noise, blocks, wanted, limits, block_s)
     of_bands = [
-        decide(mode.estimate, mode.covariance, mode.noise, blocks, wanted, limits, block_s)
+        decide_mode(mode.estimate, mode.covariance, mode.noise, blocks, wanted, limits, block_s)
         for mode in (band.main for band in poles.bands)
     ]
     imprecise = [each for each in of_bands if each.verdict is not Verdict.PRECISE] or of_bands
     return next((each for each in imprecise if not each.stop), imprecise[0])
 
 
-def decide_tissue(
-    mode: MainMode,
-    pressed: ContactLoad,
-    nominal: NominalContact | None,
+def decide_mode(
+    estimate: npt.ArrayLike,
+    covariance: npt.ArrayLike,
+    noise: npt.ArrayLike,
     blocks: int,
-    wanted: Separate,
+    wanted: Precise | Separate | None,
     limits: BlockLimits,
     block_s: float,
 ) -> Decision:
-    """Whether the pole of all blocks so far tells two tissues apart: the one at the nominal contact.
+    """`decide` of one mode.
 
     Parameters
     ----------
-    mode : MainMode
-        As measured.
-    pressed : ContactLoad
-        Force and age of the contact while it was.
-    nominal : NominalContact or None
-        To which the classes refer.
+    estimate : (2,) float
+        f0 [Hz] and damping ratio from all blocks so far; NaN where there is none yet.
+    covariance, noise : (2, 2) float
+        Of the estimate, as of `Poles.main`: the best one known, and what of it is noise; NaN where unknown.
     blocks, wanted, limits, block_s
         As `decide`.
     """
-    at = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
-    noise = mode.noise if np.all(np.isfinite(mode.noise)) else mode.covariance
-    decision = decide(at.compared, at.covariance, noise, blocks, wanted, limits, block_s)
-    if np.isnan(at.compared).any() and at.note:
-        return replace(decision, reason=at.note)
-    return decision
+    x, best, of_noise = (np.asarray(each, float) for each in (estimate, covariance, noise))
+    verdict, called = Verdict.CONTINUE, ""
+    known = np.all(np.isfinite(best)) and np.all(np.isfinite(x))
+    if blocks >= limits.least and wanted is not None and known:
+        if isinstance(wanted, Separate):
+            verdict, called = _separated(x, best, of_noise, blocks, wanted, limits)
+        else:
+            verdict = _precise(best, of_noise, blocks, wanted, limits)
+    if verdict is Verdict.CONTINUE and blocks >= limits.most:
+        verdict = Verdict.MOST_BLOCKS
+    saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
+    return Decision(verdict, blocks, saved, saved * block_s, called)
 
 
 def log_likelihood_ratio(estimate: FloatArray, covariance: FloatArray, wanted: Separate) -> float:
@@ -224,8 +202,8 @@ def _separated(
     blocks: int,
     wanted: Separate,
     limits: BlockLimits,
-) -> tuple[Verdict, str, str]:
-    """Wald's sequential probability ratio test with equal errors (Ann. Math. Stat. 16 (1945) 117).
+) -> tuple[Verdict, str]:
+    """Verdict and class, by Wald's sequential test with equal errors (Ann. Math. Stat. 16 (1945) 117).
 
     A likelihood ratio of all that was seen is a martingale under the class in its denominator, whatever the
     blocks have in common, so that its bound holds whenever the test stops (Ville). It gives up where the
@@ -233,18 +211,15 @@ def _separated(
     """
     a, b = wanted.first, wanted.second
     if classify(estimate, covariance, [a, b], NEITHER_LEVEL).name == UNKNOWN:
-        reason = f"outside of {a.name} and {b.name} ({NEITHER_LEVEL:g} of their members lie there)"
-        return Verdict.NEITHER, reason, ""
+        return Verdict.NEITHER, ""
     threshold = math.log(wanted.probability / (1 - wanted.probability))
     ratio = log_likelihood_ratio(estimate, covariance, wanted)
-    text = f"log likelihood ratio {ratio:+.2f}, +-{threshold:.2f} asked for"
-    if abs(ratio) < threshold:
-        left = 1 - blocks / limits.most
-        if left > 0 and _out_of_reach(estimate, covariance, noise, left, wanted, threshold):
-            return Verdict.HOPELESS, f"{text}, out of reach of {limits.most} blocks", ""
-        return Verdict.CONTINUE, text, ""
-    called = a.name if ratio > 0 else b.name
-    return Verdict.SEPARATED, f"{called}: {text}", called
+    if abs(ratio) >= threshold:
+        return Verdict.SEPARATED, a.name if ratio > 0 else b.name
+    left = 1 - blocks / limits.most
+    if left > 0 and _out_of_reach(estimate, covariance, noise, left, wanted, threshold):
+        return Verdict.HOPELESS, ""
+    return Verdict.CONTINUE, ""
 
 
 def _out_of_reach(
@@ -264,8 +239,6 @@ def _out_of_reach(
     going = left * (noise if known else covariance)
     last = covariance - going
     ratio = abs(log_likelihood_ratio(estimate, last, wanted))
-    if ratio >= threshold:
-        return False
     unit = np.sqrt(np.diag(going))
     values, vectors = np.linalg.eigh(going / np.outer(unit, unit))
     steps = (vectors * np.sqrt(np.maximum(values, 0))).T * unit
@@ -283,23 +256,115 @@ def _precise(
     blocks: int,
     wanted: Precise,
     limits: BlockLimits,
-) -> tuple[Verdict, str]:
+) -> Verdict:
     """Noise falls with the number of blocks, distortion and model error stay."""
-    names = (("f0", "Hz", wanted.f0_std_hz), ("damping ratio", "", wanted.damping_ratio_std))
-    missing, hopeless = [], []
-    for k, (name, unit, asked) in enumerate(names):
-        std = math.sqrt(covariance[k, k])
-        if asked is None or std <= asked:
-            continue
-        text = f"std of {name} {std:.2g} {unit}".rstrip() + f", {asked:.2g} asked for"
-        missing.append(text)
-        falling = np.fmin(noise[k, k], covariance[k, k])  # all of it where its noise is unknown
-        staying = covariance[k, k] - falling
-        last = math.sqrt(staying + falling * blocks / limits.most)
-        if last > HOPELESS_FACTOR * asked:
-            hopeless.append(f"{text}, {last:.2g} expected after {counted(limits.most, 'block')}")
-    if not missing:
-        return Verdict.PRECISE, "standard deviations as asked for"
-    if hopeless and blocks < limits.most:
-        return Verdict.HOPELESS, "; ".join(hopeless)
-    return Verdict.CONTINUE, "; ".join(missing)
+    stds = (wanted.f0_std_hz, wanted.damping_ratio_std)
+    asked = np.array([math.inf if std is None else std for std in stds])
+    variance = np.diag(covariance)
+    if np.all(np.sqrt(variance) <= asked):
+        return Verdict.PRECISE
+    falling = np.fmin(np.diag(noise), variance)  # all of it where its noise is unknown
+    last = np.sqrt(variance - falling + falling * blocks / limits.most)
+    missing = np.sqrt(variance) > asked
+    if blocks < limits.most and np.any(missing & (last > HOPELESS_FACTOR * asked)):
+        return Verdict.HOPELESS
+    return Verdict.CONTINUE
+
+
+@dataclass(frozen=True)
+class Gate:
+    """How quiet the force must be while a point is measured.
+
+    The blocks of a measurement are one record from rest, whose transient is estimated along: none can be left
+    out of it. So a measurement during which the force moved too much, as with a breath, is ended and repeated
+    in the same contact.
+
+    Attributes
+    ----------
+    force_rms_n : float
+        Most that it may move by over the whole of a measurement: `ForceSpread.rms_n` [N].
+    force_error_n : float
+        Most that its mean may differ from the scene's force [N].
+    measurements : int
+        Most that are begun in one contact.
+    """
+
+    force_rms_n: float
+    force_error_n: float = math.inf
+    measurements: int = 20
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "force_rms_n")
+        require(self.force_error_n > 0, "force_error_n", self.force_error_n, "a number above 0")
+        check_within(self, measurements=(1, 100))
+
+
+class GateKeeper:
+    """Which measurements of one contact count.
+
+    Parameters
+    ----------
+    gate : Gate or None
+        None: every one.
+    force_n : float
+        Asked for.
+
+    Attributes
+    ----------
+    left_out : list of (float, float)
+        Of each measurement that does not count, mean of the force and rms of its motion [N].
+    """
+
+    def __init__(self, gate: Gate | None, force_n: float) -> None:
+        self._gate, self._force_n = gate, force_n
+        self.left_out: list[tuple[float, float]] = []
+        self._shut = False
+
+    def shuts(self, measured: Measured) -> bool:
+        """Whether the measurement under way is to be ended: the force has moved too much, or is another.
+
+        Raises
+        ------
+        PointFailed
+            If it is not known how the force moved.
+        """
+        if self._gate is None:
+            return False
+        contact = measured.origin.contact
+        if math.isnan(contact.spread.rms_n):
+            reason = contact.reason or "too few forces were measured"
+            raise PointFailed(f"gate: how the force moved is unknown: {reason}")
+        off_n = abs(contact.force_n - self._force_n)
+        loud = contact.spread.rms_n > self._gate.force_rms_n or off_n > self._gate.force_error_n
+        self._shut = self._shut or loud
+        return self._shut
+
+    def counts(self, measured: Measured) -> bool:
+        """Whether a measurement that has ended counts.
+
+        Raises
+        ------
+        PointFailed
+            If it does not, and no other may be begun.
+        """
+        if not self.shuts(measured):
+            return True
+        assert self._gate is not None
+        contact = measured.origin.contact
+        self.left_out.append((contact.force_n, contact.spread.rms_n))
+        self._shut = False
+        if len(self.left_out) < self._gate.measurements:
+            return False
+        raise PointFailed(f"gate: the force was never quiet: {self}")
+
+    def __str__(self) -> str:
+        """What was left out, for people; empty: nothing."""
+        gate = self._gate
+        if gate is None or not self.left_out:
+            return ""
+        each = ", ".join(f"{1e3 * mean:.2f} (rms {1e3 * rms:.2f})" for mean, rms in self.left_out)
+        accepted = f"rms up to {1e3 * gate.force_rms_n:g} mN"
+        if gate.force_error_n < math.inf:
+            low, high = (1e3 * (self._force_n + s * gate.force_error_n) for s in (-1, 1))
+            accepted = f"{low:g} to {high:g} mN, {accepted}"
+        return f"measurements left out: {len(self.left_out)}, with a force of {each} mN; accepted is {accepted}"

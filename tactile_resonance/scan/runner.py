@@ -14,8 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from tactile_resonance.poles.result import MainMode, Poles
-from tactile_resonance.scan.decision import Decision, Separate, Verdict, decide_bands, decide_tissue
-from tactile_resonance.scan.gate import GateKeeper
+from tactile_resonance.scan.decision import Decision, GateKeeper, Verdict, decide
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Check,
@@ -164,14 +163,18 @@ class ScanRunner:
 
     def _point(self, point: ScanPoint) -> None:
         """One attempt at a point, finished with a result whatever happens, unless it shall be repeated."""
-        scene, begun_s = self._scene, self._hands.now_s()
+        scene, design = self._scene, self._plan.measurement
+        begun_s = self._hands.now_s()
         decisions: list[Decision] = []
         keeper = GateKeeper(scene.gate, scene.force_n)
         tests = [asked for asked in scene.protocols if asked.concerns(point.index)]
         longest_s = scene.time_limits.point_s + sum(asked.longest_s for asked in tests)
 
         def enough(measured: Measured, blocks: int) -> bool:
-            decisions.append(self._decide(measured, blocks))
+            force = measured.origin.contact
+            pressed = ContactLoad(force.force_n, force.force_std_n, measured.contact_age_s)
+            wanted = scene.nominal_contact, blocks, scene.precision, design.blocks, design.block_s
+            decisions.append(decide(measured.poles, pressed, *wanted))
             self._say(point, Phase.MEASURE, blocks, measured.poles)
             return keeper.shuts(measured) or decisions[-1].stop
 
@@ -193,7 +196,7 @@ class ScanRunner:
                 self._say(point, Phase.MEASURE)
                 while measured is None:
                     made = self._hands.measure(
-                        self._plan.measurement,
+                        design,
                         point.label,
                         seed + len(keeper.left_out) * GATE_SEEDS,
                         enough,
@@ -240,7 +243,7 @@ class ScanRunner:
                 repeats=disturbed.total,
                 disturbances=str(disturbed),
                 gate="" if measured is None else str(keeper),
-                vibration_s=len(decisions) * self._plan.measurement.block_s,
+                vibration_s=len(decisions) * design.block_s,
                 between_s=begun_s - self._left_s,
                 **spent_s,
             )
@@ -273,16 +276,6 @@ class ScanRunner:
             except PointFailed as error:
                 failed = _joined(failed, f"{asked.kind.value}: {error}")
         return failed
-
-    def _decide(self, measured: Measured, blocks: int) -> Decision:
-        block_s = self._plan.measurement.block_s
-        wanted, limits = self._scene.precision, self._plan.measurement.blocks
-        if isinstance(wanted, Separate):
-            force, nominal = measured.origin.contact, self._scene.nominal_contact
-            pressed = ContactLoad(force.force_n, force.force_std_n, measured.contact_age_s)
-            mode = measured.poles.main
-            return decide_tissue(mode, pressed, nominal, blocks, wanted, limits, block_s)
-        return decide_bands(measured.poles, blocks, wanted, limits, block_s)
 
     def _reference(self, name: str) -> None:
         """Measure in free air: the sensor's health and drift; one that fails does not end the scan.
@@ -340,7 +333,7 @@ class ScanRunner:
                 result = replace(result, simulated=measured.origin.simulated)
                 if not silent:
                     in_air = replace(self._scene, tissue_classes=(), nominal_contact=None)
-                    decision = Decision(Verdict.MOST_BLOCKS, "", told)
+                    decision = Decision(Verdict.MOST_BLOCKS, told)
                     result = measured_result(result, in_air, measured, decision)
                 result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
                 self._publish(recording.finish(result))

@@ -7,7 +7,6 @@ bench reads (`tactile_resonance.simulation.tissue.scene`) and a scan does not ne
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
@@ -31,7 +30,7 @@ from tactile_resonance.fields import (
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, PoleBand
 from tactile_resonance.scan.adaptive import Adaptive, read_adaptive
 from tactile_resonance.scan.clearance import is_plane
-from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
+from tactile_resonance.scan.decision import BlockLimits, Gate, Precise, Separate
 from tactile_resonance.scan.period import residual_terms_of
 from tactile_resonance.scan.points import flat, read_positions, require_near
 from tactile_resonance.scan.surface import NormalRequest, Plane, Surface, TouchRequest, read_surface
@@ -179,30 +178,6 @@ class DriftLimits:
 
     def __post_init__(self) -> None:
         check_above_zero(self, "f0_hz", "damping_ratio")
-
-
-@dataclass(frozen=True)
-class Gate:
-    """How quiet the force must be while a point is measured.
-
-    Attributes
-    ----------
-    force_rms_n : float
-        Most that it may move by over the whole of a measurement: `ForceSpread.rms_n` [N].
-    force_error_n : float
-        Most that its mean may differ from the scene's force [N].
-    measurements : int
-        Most that are begun in one contact.
-    """
-
-    force_rms_n: float
-    force_error_n: float = math.inf
-    measurements: int = 20
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "force_rms_n")
-        require(self.force_error_n > 0, "force_error_n", self.force_error_n, "a number above 0")
-        check_within(self, measurements=(1, 100))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.record import Contact, Origin
-from tactile_resonance.scan.decision import decide
+from tactile_resonance.scan.decision import decide_mode
 from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_outcome import attempt_at, measured_result
@@ -69,7 +69,7 @@ def measure(scene, phantoms, design, bench, point, attempt):
             harmonics=excitation.harmonics,
             band_hz=band,
         )
-        decision = decide(
+        decision = decide_mode(
             poles.main.estimate,
             poles.main.covariance,
             poles.main.noise,

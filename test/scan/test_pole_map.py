@@ -68,7 +68,7 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
     assert mode.estimate[0] == 280.0
     np.testing.assert_allclose(mode.drift, [-0.3, 2e-4])
     np.testing.assert_allclose(mode.drift_std, [0.2, 2e-5])
-    attempt, decision = attempt_at(air_point(3), 0, "table"), Decision(Verdict.MOST_BLOCKS, "", 8)
+    attempt, decision = attempt_at(air_point(3), 0, "table"), Decision(Verdict.MOST_BLOCKS, 8)
     result = measured_result(attempt, scene(), Measured(modes, origin()), decision)
     assert (result.f0_drift_hz_per_s, result.damping_drift_per_s) == (-0.3, 2e-4)
     assert result.f0_drift_std_hz_per_s == pytest.approx(0.2)
@@ -80,7 +80,7 @@ def test_the_drift_of_a_result_is_that_of_the_mode_on_the_map():
 def test_how_the_force_moved_stands_in_the_result():
     there = origin()
     there = replace(there, contact=replace(there.contact, spread=ForceSpread(3e-4, 0.009, 0.011)))
-    attempt, decision = attempt_at(air_point(3), 0, "table"), Decision(Verdict.MOST_BLOCKS, "", 8)
+    attempt, decision = attempt_at(air_point(3), 0, "table"), Decision(Verdict.MOST_BLOCKS, 8)
     result = measured_result(attempt, scene(), Measured(poles((250.0,)), there), decision)
     assert (result.force_rms_n, result.force_min_n, result.force_max_n) == (3e-4, 0.009, 0.011)
     header, row = as_csv([result]).splitlines()
