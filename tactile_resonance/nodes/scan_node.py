@@ -194,7 +194,7 @@ class ScanNode(ManagedNode):
         """Open the run and scan; the result is filled in as far as that comes."""
         (seed,) = values(self, "seed")
         controls, files = self._goals.controls, self._files
-        started = start_run(
+        plan, run, seed = start_run(
             files.checked(scan_goal(goal.request)),
             frames,
             files,
@@ -204,7 +204,6 @@ class ScanNode(ManagedNode):
             tell=self._tell,
             check=controls.check_cancelled,
         )
-        run, plan = started.run, started.plan
         for problem in run.content.problems:
             self.get_logger().warning(f"damaged, left out of the run: {problem}")
         if UNCHECKED in plan.skipped:
@@ -222,7 +221,7 @@ class ScanNode(ManagedNode):
                 self._hands,
                 controls,
                 self._tell,
-                started.seed,
+                seed,
                 self._publish,
             )
             fill_scan_result(result, runner.run())

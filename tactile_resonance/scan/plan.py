@@ -155,10 +155,10 @@ class Plan:
             If there is no point.
         """
         if not points:
-            raise ValueError(f"positions: all {len(left)} are left out; the first: {left[0].why}")
+            raise ValueError(f"positions: all {len(left)} are left out; the first: {left[0][1]}")
         each_s = self.longest_s / len(self.points)
         numbered = tuple(self._numbered(point, index) for index, point in enumerate(points))
-        entries = [Skipped(f"the point at {_in_mm(out.point)}", out.why, each_s) for out in left]
+        entries = [Skipped(f"the point at {_in_mm(point)}", why, each_s) for point, why in left]
         return replace(self, points=numbered, left_out=(*self.left_out, *entries))
 
     def clear_of(self, surface: Surface, use: TipUse | None) -> Plan:

@@ -53,12 +53,8 @@ class ScanPoint:
         require(self.index >= 0, "index", self.index, "0 or above")
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """A point that is left out of a plan, and why."""
-
-    point: ScanPoint
-    why: str
+LeftOut = tuple[ScanPoint, str]
+"""A point that is left out of a plan, and why."""
 
 
 def scan_points(

@@ -74,13 +74,12 @@ def prepare(
     if isinstance(surface, TouchRequest):
         force_n, count = surface.force_n or scene.force_n, len(surface.points_m)
         try:
-            found = find_surface(
+            found, touches = find_surface(
                 surface, ball_radius_m, heading_rad, lambda point: find(point, force_n, count)
             )
         except (ValueError, PointFailed, ScanEnded) as error:
             raise ValueError(f"surface.touch: {error}") from error
-        facts["surface"] = found.as_json()
-        surface = found.surface
+        facts["surface"], surface = found.as_json(touches), found
         plan = make_plan(scene, surface)
     use: TipUse | None = None
     # of a plane contact control keeps the sensor clear itself
@@ -177,7 +176,7 @@ def find_normals(
         except PointDisturbed:  # says nothing of the point
             raise
         except (PointFailed, ValueError) as error:
-            left.append(LeftOut(point, f"normals: {error}"))
+            left.append((point, f"normals: {error}"))
         else:
             found.append(normal)
     return tuple(found), tuple(left)

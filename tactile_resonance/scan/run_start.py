@@ -7,7 +7,7 @@ import platform
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -30,13 +30,8 @@ from tactile_resonance.sensor import sensor_named
 _LIBRARIES = ("numpy", "scipy", "rosbags", "ur-rtde", "python-can")
 
 
-@dataclass(frozen=True)
-class StartedRun:
-    """A run that is open, with all that a `ScanRunner` needs of it."""
-
-    plan: Plan
-    run: RunDirectory
-    seed: int
+StartedRun = tuple[Plan, RunDirectory, int]
+"""A run that is open: its plan, folder and seed."""
 
 
 def new_run(
@@ -128,7 +123,7 @@ def start_run(
     )
     places = plan.points if scene.adaptive else ()
     run = RunDirectory.create(path, text, plan.first_points, facts, needed, places)
-    return StartedRun(plan, run, seed)
+    return plan, run, seed
 
 
 def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
@@ -149,7 +144,7 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
         _require_tests(scene, hands)
         scene = _placed(scene, replace(frames, others=_frames_of(facts, scene, frames)), hands)
         points = run.content.places or run.content.points
-        return StartedRun(plan_points(scene, points), run, int(facts["seed"]))
+        return plan_points(scene, points), run, int(facts["seed"])
     except BaseException:
         run.close()
         raise

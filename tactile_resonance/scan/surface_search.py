@@ -81,6 +81,22 @@ class TouchedSurface:
         """(...) in the square about the contacts: a form fitted to them need not go on beside them."""
         return np.all(np.abs(np.asarray(xy_m, float) - self.center_m) <= self.scale_m, axis=-1)
 
+    def as_json(self, touches: Sequence[Touch]) -> dict[str, Any]:
+        """What a run keeps of it and of the touches that it rests on; lengths in metres."""
+        spare = len(touches) - self.coefficients_m.size
+        return {
+            "form": self.form,
+            "touches": [
+                {"ball_m": list(touch.ball_m), "std_m": touch.std_m, "force_n": touch.force_n}
+                for touch in touches
+            ],
+            "residuals_m": self.residuals_m.tolist(),
+            "consistent": self.consistent if spare else None,
+            "center_m": self.center_m.tolist(),
+            "scale_m": self.scale_m,
+            "coefficients_m": self.coefficients_m.tolist(),
+        }
+
     def _basis(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Terms (..., k) and their derivatives by x and y [1/m]."""
         x, y = np.moveaxis((np.asarray(xy_m, float) - self.center_m) / self.scale_m, -1, 0)
@@ -152,43 +168,13 @@ def _basis(
     return first, second / scale_m, third / scale_m
 
 
-@dataclass(frozen=True, eq=False)
-class FoundSurface:
-    """A surface and the touches it rests on.
-
-    Attributes
-    ----------
-    surface : TouchedSurface
-    touches : tuple of Touch
-    """
-
-    surface: TouchedSurface
-    touches: tuple[Touch, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """What a run keeps of it; lengths in metres."""
-        spare = len(self.touches) - self.surface.coefficients_m.size
-        return {
-            "form": self.surface.form,
-            "touches": [
-                {"ball_m": list(touch.ball_m), "std_m": touch.std_m, "force_n": touch.force_n}
-                for touch in self.touches
-            ],
-            "residuals_m": self.surface.residuals_m.tolist(),
-            "consistent": self.surface.consistent if spare else None,
-            "center_m": self.surface.center_m.tolist(),
-            "scale_m": self.surface.scale_m,
-            "coefficients_m": self.surface.coefficients_m.tolist(),
-        }
-
-
 def find_surface(
     request: TouchRequest,
     ball_radius_m: float,
     heading_rad: float,
     touch: Callable[[ScanPoint], Touch],
-) -> FoundSurface:
-    """Touch all places of a request and fit its form.
+) -> tuple[TouchedSurface, list[Touch]]:
+    """Touch all places of a request and fit its form: the surface, and the touches it rests on.
 
     The first place is expected at the height that the request states, the others where those before suggest: on
     their plane as soon as it is known. Before, surfaces are searched for as far as the request says.
@@ -230,7 +216,7 @@ def find_surface(
             f"the {request.form} through all; accepted are {1e3 * request.tolerance_m:g} mm (tolerance_m). "
             "Another form, or a touch that was none?"
         )
-    return FoundSurface(surface, tuple(touches))
+    return surface, touches
 
 
 def fit_touches(touches: Sequence[Touch], form: str, ball_radius_m: float) -> TouchedSurface:

@@ -174,8 +174,8 @@ def calibrate_table(
     wanted = TouchRequest(
         xy, "plane", request.height_m, request.force_n, math.inf, request.search_m
     )
-    found = find_surface(wanted, ball_radius_m, request.heading_rad, touch)
-    return table_from_touches(request, table_in_base, ball_radius_m, found.touches)
+    _, touches = find_surface(wanted, ball_radius_m, request.heading_rad, touch)
+    return table_from_touches(request, table_in_base, ball_radius_m, touches)
 
 
 def table_from_touches(

@@ -93,9 +93,9 @@ def test_bump_between_two_points_is_crossed_at_the_standoff_or_not_at_all(height
     kept, left = clear_points((first, then), bump, USE)
     assert len(kept) == (2 if clear else 1)
     if not clear:
-        (out,) = left
-        assert out.point == then
-        assert "on the way from point 1 the sensor would be -0." in out.why
+        ((point, why),) = left
+        assert point == then
+        assert "on the way from point 1 the sensor would be -0." in why
 
 
 @pytest.mark.parametrize(("radius_m", "reach_m"), [(-0.03, 0.012), (0.15, 0.02)])

@@ -241,7 +241,7 @@ def observed(tmp_path, content):
     bench.age_known = content["force_n"] != 0.010002
     goal = ScanGoal(scene=str(path), run_directory=str(tmp_path / "run"))
     try:
-        started = start_run(
+        plan, run, _ = start_run(
             *(goal, FRAMES, GoalFiles("", ["/"]), bench),
             seed=1,
             tip_use=None,
@@ -250,8 +250,8 @@ def observed(tmp_path, content):
         )
     except ValueError as error:
         return str(error)
-    with started.run:
-        summary = ScanRunner(started.plan, started.run, bench, Controls(), lambda _: None).run()
+    with run:
+        summary = ScanRunner(plan, run, bench, Controls(), lambda _: None).run()
     run = read_run(tmp_path / "run")
     results = [asdict(result) for result in run.latest]
     for result in results:
@@ -266,7 +266,7 @@ def observed(tmp_path, content):
         "log": bench.log,
         "frame": bench.frame_in_base.vector.tolist(),
         "results": results,
-        "drift": judge_drift(air, moved, started.plan.scene.drift_limits),
+        "drift": judge_drift(air, moved, plan.scene.drift_limits),
         "maps": len(pole_maps_of(run)),
         "summary": summary.message,
         "found": {
