@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.scan.kept_bins import bins_of_point, keep_bins
+from tactile_resonance.scan.kept_bins import keep_bins
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.points import ScanPoint
@@ -37,11 +37,7 @@ def make_run(run: Path, points: int = POINTS) -> Path:
                 for number, (topic, kind, message) in enumerate(measurement(101 + k)):
                     recording.write(topic, kind, time_ns + number, to_cdr(message))
                 recording.finish(_result(k, time_ns + 10**6))
-    keep_bins(
-        run,
-        BAND_HZ,
-        lambda folder, results, band_hz: iter([bins_of_point(folder, of, band_hz) for of in results]),
-    )
+    keep_bins(run, BAND_HZ)
     return run
 
 

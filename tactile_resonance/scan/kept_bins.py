@@ -17,7 +17,7 @@ import shutil
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -37,10 +37,9 @@ if TYPE_CHECKING:
 
 NAME = "bins.npz"
 FORMAT = "tactile_resonance bins 1"
-PLACE = ("index", "attempt", "measurement_id", "x_m", "y_m", "z_m")
-_PLACES = [("index", "<i4"), ("attempt", "<i4"), ("measurement_id", "<i8")] + [
-    (name, "<f8") for name in PLACE[3:]
-]
+PLACE = {"index": "<i4", "attempt": "<i4", "measurement_id": "<i8"}
+PLACE |= dict.fromkeys(("x_m", "y_m", "z_m"), "<f8")
+"""Types of what says which point a row is of, by name."""
 _LOCAL_HEADER = (
     30  # bytes of a member's header before its name (PKWARE APPNOTE 6.3.10, section 4.3.7)
 )
@@ -77,7 +76,7 @@ class BinsKind:
     def dtype(self) -> np.dtype:
         """Of the row of a point."""
         shape = (self.realisations, self.count)
-        return np.dtype([*_PLACES, ("u", "<c8", shape), ("y", "<c8", shape)])
+        return np.dtype([*PLACE.items(), ("u", "<c8", shape), ("y", "<c8", shape)])
 
     def bins(self, row: npt.NDArray) -> BandBins:
         """Of one point."""
@@ -150,9 +149,10 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
 
 
 def bins_of_point(
-    run: Path, result: PointResult, band_hz: tuple[float, float]
+    job: tuple[Path, PointResult, tuple[float, float]],
 ) -> tuple[BinsKind, npt.NDArray] | str:
-    """Kind and row (1,) of a point of a run, from its records; why there is none as text."""
+    """Kind and row (1,) of a point of a run in a band, from its records; why there is none as text."""
+    run, result, band_hz = job
     name = f"point {result.index}"
     try:
         recording = recording_of_point(run, result)
@@ -176,7 +176,8 @@ def bins_of_point(
 def keep_bins(
     run: Path,
     band_hz: tuple[float, float],
-    of_points: Callable[[Path, list[PointResult], tuple[float, float]], Iterator],
+    each: Callable[[Callable, Iterable], Iterable] = map,
+    progress: Callable[[str, int, int], None] = lambda what, done, of: None,
 ) -> KeptBins:
     """Make ``bins.npz`` of a run, of the latest attempt at each finished point.
 
@@ -184,8 +185,10 @@ def keep_bins(
     ----------
     run : Path
     band_hz : (low, high)
-    of_points : callable
-        What `bins_of_point` gives for each of some results, in whatever processes.
+    each : callable
+        As `map`, in whatever processes.
+    progress : callable
+        Told what is done, how many points are, and of how many.
 
     Raises
     ------
@@ -198,7 +201,9 @@ def keep_bins(
     kinds: dict[BinsKind, str] = {}
     left_out = list(content.problems)
     with RowsWriter(run / NAME) as writer:
-        for found in of_points(run, list(content.latest), band_hz):
+        jobs = ((run, result, band_hz) for result in content.latest)
+        for done, found in enumerate(each(bins_of_point, jobs), start=1):
+            progress(f"bins of {run.name}", done, len(content.latest))
             if isinstance(found, str):
                 left_out.append(found)
                 continue

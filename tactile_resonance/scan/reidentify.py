@@ -33,11 +33,9 @@ from tactile_resonance.scan.kept_bins import (
     BinsKind,
     KeptBins,
     RowsWriter,
-    bins_of_point,
     keep_bins,
     kept_bins,
 )
-from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.run_content import read_plan
 from tactile_resonance.scan.scene import SensorUse
 
@@ -87,8 +85,8 @@ def row_type(places: int) -> np.dtype:
         for name in _MODE
     ]
     return np.dtype(
-        [("run", "<i4"), ("index", "<i4"), ("attempt", "<i4"), ("measurement_id", "<i8")]
-        + [(name, "<f8") for name in (*PLACE[3:], *modes, *_COSTS)]
+        [("run", "<i4"), *PLACE.items()]
+        + [(name, "<f8") for name in (*modes, *_COSTS)]
         + [(STATUS, "<u1")]
     )
 
@@ -144,7 +142,7 @@ def reidentify(
     with _Processes() as processes:
         kept = []
         for run, band, model in zip(runs, bands, structures, strict=True):
-            kept.append(kept_bins(run, band) or _keep(processes, run, band, progress))
+            kept.append(kept_bins(run, band) or keep_bins(run, band, processes.in_order, progress))
             left_out += [f"{run}: {text}" for text in kept[-1].left_out]
             for kind, _ in kept[-1].kinds:
                 _plan(kind, band, model)  # raises what does not suit
@@ -176,25 +174,6 @@ def reidentify(
         finally:
             part.unlink(missing_ok=True)
     return +counts, left_out
-
-
-def _keep(
-    processes: _Processes,
-    run: Path,
-    band_hz: tuple[float, float],
-    progress: Callable[[str, int, int], None],
-) -> KeptBins:
-    def of_points(run: Path, results: list[PointResult], band_hz: tuple[float, float]) -> Iterator:
-        jobs = ((run, result, band_hz) for result in results)
-        for k, found in enumerate(processes.in_order(_bins_of_point, jobs)):
-            progress(f"bins of {run.name}", k + 1, len(results))
-            yield found
-
-    return keep_bins(run, band_hz, of_points)
-
-
-def _bins_of_point(job: tuple) -> tuple[BinsKind, npt.NDArray] | str:
-    return bins_of_point(*job)
 
 
 def _jobs(
@@ -258,7 +237,7 @@ def _fill(rows: npt.NDArray, batch: PolesBatch) -> None:
 
 
 def _fill_one(row: npt.NDArray, poles: Poles) -> None:
-    _fill_nan(row, PLACE)
+    _fill_nan(row, tuple(PLACE))
     alone = {
         name: np.asarray(getattr(poles, name))[None]
         for name in (*("poles_rad_s", "residues", "f0_hz", "damping_ratio"), *_COSTS)
