@@ -27,11 +27,9 @@ class Version(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
         """End with status 0."""
-        from tactile_resonance.configuration import share_path
+        from tactile_resonance.configuration import package_version
 
-        manifest = share_path("package.xml").read_text(encoding="utf-8")
-        version = manifest.partition("<version>")[2].partition("</version>")[0]
-        print(f"tactile_resonance {version}")
+        print(f"tactile_resonance {package_version()}")
         parser.exit()
 
 

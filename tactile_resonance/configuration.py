@@ -45,6 +45,13 @@ def share_path(relative: str | Path) -> Path:
     raise FileNotFoundError(f"shared file {str(relative)!r} not found; looked at:\n  {places}")
 
 
+def package_version() -> str:
+    """Version of this package, which stands in package.xml."""
+    from xml.etree import ElementTree  # a node that does not ask need not load it
+
+    return str(ElementTree.parse(share_path("package.xml")).findtext("version"))
+
+
 def shared_file(path: Path, folder: str) -> Path:
     """Return a path as it is, or, for a bare name that is no file here, that of a shared folder.
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import platform
 import time
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from tactile_resonance.configuration import PACKAGE_NAME, share_path
+from tactile_resonance.configuration import PACKAGE_NAME, package_version
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.scan.clearance import Standoffs, TipUse
@@ -215,11 +214,7 @@ def run_facts(plan: Plan, seed: int, more: Mapping[str, Any] | None = None) -> d
 
 def _versions() -> dict[str, str]:
     """Of this package, Python and the libraries that results depend on; those absent are left out."""
-    try:
-        own = ElementTree.parse(share_path("package.xml")).getroot().findtext("version")
-    except FileNotFoundError:  # neither the source tree nor an installation for ROS
-        own = version(PACKAGE_NAME)
-    found = {PACKAGE_NAME: str(own), "python": platform.python_version()}
+    found = {PACKAGE_NAME: package_version(), "python": platform.python_version()}
     for name in _LIBRARIES:
         try:
             found[name] = version(name)
