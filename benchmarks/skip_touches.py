@@ -38,7 +38,8 @@ MEASURE_S = 0.8
 """Two blocks, as the demo's points take."""
 SQUARE = SIDE_M / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 ASKED = Adaptive(
-    SQUARE, SPACING_M, SMALLEST_M, START, MOST, WantedBoundary(LevelSet(low=LEVEL_HZ), WANTED_M2)
+    *(SQUARE, WantedBoundary(LevelSet(low=LEVEL_HZ), WANTED_M2)),
+    *(MOST, SMALLEST_M, START, SPACING_M),
 )
 
 

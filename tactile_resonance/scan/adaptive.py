@@ -15,19 +15,26 @@ between points, and a size such that a level is not more than one standard devia
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from tactile_resonance._typing import FloatArray, IntArray
-from tactile_resonance.fields import build, check_above_zero, check_within, read_dataclass, require
+from tactile_resonance.fields import (
+    build,
+    check_above_zero,
+    check_within,
+    one_of,
+    read_dataclass,
+    require,
+)
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.points import Pair, Places, corners, grid, inside_polygon
+from tactile_resonance.scan.points import Pair, Places, corners, grid, inside_polygon, on_a_line
 from tactile_resonance.tissue.classify import TissueClass
 
 MOST_PLACES = 2500
@@ -71,7 +78,10 @@ class WantedMap:
     """Wanted: f0 everywhere with this standard deviation; the loss is the variance above it."""
 
     f0_std_hz: float
-    most_loss: float = 0.0
+    most_loss: ClassVar[float] = 0.0
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "f0_std_hz")
 
     def loss(self, f0_hz: FloatArray, std_hz: FloatArray) -> FloatArray:
         """(...) per area."""
@@ -98,21 +108,25 @@ class Adaptive:
     ----------
     polygon_m : (k, 2) float
         Corners of the region.
-    spacing_m : float
-        Of the grid of places that may be touched.
+    wanted : WantedBoundary or WantedMap
+    most, start : int
+        All touches, and the first ones.
     smallest_m : float
         Width of the smallest thing that is looked for.
-    start, most : int
-        First touches, and all.
-    wanted : WantedBoundary or WantedMap
+    spacing_m : float
+        Of the grid of places that may be touched.
     """
 
     polygon_m: FloatArray
-    spacing_m: float
-    smallest_m: float
-    start: int
-    most: int
     wanted: WantedBoundary | WantedMap
+    most: int
+    smallest_m: float
+    start: int = 9
+    spacing_m: float = 0.001
+
+    def __post_init__(self) -> None:
+        check_above_zero(self, "spacing_m", "smallest_m")
+        check_within(self, most=(LEAST_POINTS, MOST_TOUCHES), start=(LEAST_POINTS, self.most))
 
     @cached_property
     def raster(self) -> Raster:
@@ -142,7 +156,7 @@ class Adaptive:
         good = LEAST_POINTS <= len(kept) <= MOST_PLACES
         accepted = f"a spacing with {LEAST_POINTS} to {MOST_PLACES} places in the region"
         require(good, "spacing_m", f"{self.spacing_m:g}, {len(kept)} places", accepted)
-        wide = _is_wide(kept, self.spacing_m)
+        wide = not on_a_line(kept, self.spacing_m / 2)
         accepted = "a region and a spacing with places that are not all on one line"
         require(wide, "spacing_m", f"{self.spacing_m:g}, {len(kept)} places on a line", accepted)
         return kept
@@ -154,7 +168,7 @@ class Adaptive:
     def krige(self, known: tuple[FloatArray, FloatArray, FloatArray]) -> KrigedSurface | None:
         """What `known_points` lead to; None where they are too few or on one line."""
         xy_m, f0_hz, std_hz = known
-        if len(xy_m) < LEAST_POINTS or not _is_wide(xy_m, self.spacing_m):
+        if len(xy_m) < LEAST_POINTS or on_a_line(xy_m, self.spacing_m / 2):
             return None
         return krige(xy_m, f0_hz, std_hz, _LENGTH * self.smallest_m, self.wanted.least_std(f0_hz))
 
@@ -261,8 +275,18 @@ def read_adaptive(value: Mapping[str, Any], classes: Sequence[TissueClass], wher
     ValueError
         That names the field, its value and what is accepted.
     """
-    asked = read_dataclass(_Asked, value, where)
-    return build(asked.adaptive, where, classes)
+    own = {field.name for field in fields(Adaptive)} - {"polygon_m", "wanted"}
+    beside = {*own, *(field.name for field in fields(_Within))}
+    value = {key: item for key, item in value.items() if item is not None}
+    _, wanted = one_of(_WANTED, value, where, frozenset(beside))
+    if not isinstance(wanted, WantedMap):
+        means = {each.name: float(each.mean[0]) for each in classes}
+        wanted = WantedBoundary(build(wanted.level_set, where, means), wanted.area_m2)
+    region, rest = ({k: v for k, v in value.items() if k in keys} for keys in (beside - own, own))
+    polygon_m = build(read_dataclass(_Within, region, where).polygon, where)
+    made = read_dataclass(Adaptive, rest, where, polygon_m=polygon_m, wanted=wanted)
+    build(made.places_m, where)
+    return made
 
 
 @dataclass(frozen=True)
@@ -271,11 +295,13 @@ class _Boundary:
     f0_hz: float | None = None
     between: tuple[str, str] | None = None
 
+    def __post_init__(self) -> None:
+        check_above_zero(self, "area_m2", "f0_hz")
+
     def level_set(self, classes: Mapping[str, float]) -> LevelSet:
         one = (self.f0_hz is None) != (self.between is None)
         require(one, "boundary", None, "exactly one of f0_hz, between")
         if self.between is None:
-            check_above_zero(self, "f0_hz")
             return LevelSet(low=float(self.f0_hz or 0.0))
         good = len({*self.between} & {*classes}) == 2
         accepted = f"two out of tissue_classes: {sorted(classes)}"
@@ -290,6 +316,9 @@ class _Tissue:
     name: str
     area_m2: float
 
+    def __post_init__(self) -> None:
+        check_above_zero(self, "area_m2")
+
     def level_set(self, classes: Mapping[str, float]) -> LevelSet:
         accepted = f"one out of two or more tissue_classes: {sorted(classes)}"
         require(self.name in classes and len(classes) > 1, "tissue.name", self.name, accepted)
@@ -300,61 +329,19 @@ class _Tissue:
         return LevelSet(max(below, default=-np.inf), min(above, default=np.inf))
 
 
-@dataclass(frozen=True)
-class _Map:
-    f0_std_hz: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "f0_std_hz")
+_WANTED = {"boundary": _Boundary, "tissue": _Tissue, "map": WantedMap}
 
 
 @dataclass(frozen=True, eq=False)
-class _Asked:
-    most: int
-    smallest_m: float
-    start: int = 9
-    spacing_m: float = 0.001
+class _Within:
     center_m: Pair | None = None
     size_m: Pair | None = None
     polygon_m: Places | None = None
-    boundary: _Boundary | None = None
-    tissue: _Tissue | None = None
-    map: _Map | None = None
 
-    def __post_init__(self) -> None:
-        check_above_zero(self, "spacing_m", "smallest_m")
-        check_within(self, most=(LEAST_POINTS, MOST_TOUCHES), start=(LEAST_POINTS, self.most))
-
-    def adaptive(self, classes: Sequence[TissueClass]) -> Adaptive:
-        """Checked, with what follows from the classes."""
-        wanted = [each for each in (self.boundary, self.tissue, self.map) if each is not None]
-        accepted = "exactly one of boundary, tissue, map"
-        require(
-            len(wanted) == 1,
-            "wanted",
-            [type(each).__name__[1:].lower() for each in wanted],
-            accepted,
-        )
-        means = {each.name: float(each.mean[0]) for each in classes}
-        of_kind: WantedBoundary | WantedMap
-        if self.map is not None:
-            of_kind = WantedMap(self.map.f0_std_hz)
-        else:
-            asked = self.boundary or self.tissue
-            assert asked is not None
-            require(asked.area_m2 > 0, "area_m2", asked.area_m2, "a number above 0")
-            of_kind = WantedBoundary(asked.level_set(means), asked.area_m2)
-        made = Adaptive(
-            self._polygon(), self.spacing_m, self.smallest_m, self.start, self.most, of_kind
-        )
-        made.places_m()
-        return made
-
-    def _polygon(self) -> FloatArray:
-        box = self.center_m is not None and self.size_m is not None
+    def polygon(self) -> FloatArray:
         given = (self.center_m, self.size_m, self.polygon_m)
-        alone = box and self.polygon_m is None
-        alone |= self.polygon_m is not None and self.center_m is None and self.size_m is None
+        there = [each is not None for each in given]
+        alone = there in ([True, True, False], [False, False, True])
         require(alone, "center_m, size_m, polygon_m", given, "center_m and size_m, or polygon_m")
         if self.polygon_m is not None:
             return corners(self.polygon_m)
@@ -362,11 +349,6 @@ class _Asked:
         require(bool(size.min() > 0), "size_m", self.size_m, "numbers above 0")
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         return np.asarray(center + signs * size / 2)
-
-
-def _is_wide(xy_m: FloatArray, spacing_m: float) -> bool:
-    """Whether places (n, 2) are not all on one line."""
-    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), tol=spacing_m / 2) == 2)
 
 
 def _spread(places_m: FloatArray, count: int) -> list[int]:

@@ -167,6 +167,11 @@ def inside_polygon(xy_m: npt.ArrayLike, polygon_m: npt.ArrayLike) -> BoolArray:
     return np.asarray(odd | on_edge)
 
 
+def on_a_line(xy_m: FloatArray, near_m: float | None = None) -> bool:
+    """Whether (n, 2) positions are on one line, or so near to it; None: up to rounding."""
+    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), tol=near_m) < 2)
+
+
 def corners(polygon_m: FloatArray) -> FloatArray:
     """(k, 2) of a polygon as a scene gives it, (k, 3).
 
@@ -177,8 +182,7 @@ def corners(polygon_m: FloatArray) -> FloatArray:
     """
     xy_m = polygon_m[:, :2]
     require(len(xy_m) >= 3, "polygon_m", len(xy_m), "three corners or more")
-    wide = np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0)) == 2
-    require(bool(wide), "polygon_m", xy_m.tolist(), "corners that are not all on one line")
+    require(not on_a_line(xy_m), "polygon_m", xy_m.tolist(), "corners that are not all on one line")
     return np.asarray(xy_m)
 
 

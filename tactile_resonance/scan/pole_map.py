@@ -23,6 +23,7 @@ from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, TiledSur
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.tissue.classify import UNKNOWN
+from tactile_resonance.scan.points import on_a_line
 
 LOW_RGB = (64, 105, 255)
 HIGH_RGB = (255, 210, 50)
@@ -210,7 +211,7 @@ class PoleMap:
         if len(points) < LEAST_POINTS:
             return None
         xy = np.array([p.position_m[:2] for p in points])
-        if _on_a_line(xy):
+        if on_a_line(xy, SAME_PLACE_M):  # nothing is known beside it
             return None
         return krige_many(xy, [p.result.f0_hz for p in points], [p.result.f0_std_hz for p in points])
 
@@ -223,7 +224,7 @@ class PoleMap:
             replace(p.result, x_m=float(p.position_m[0]), y_m=float(p.position_m[1]))
             for p in self.estimated
         )
-        if len(xy) < LEAST_POINTS or _on_a_line(xy):
+        if len(xy) < LEAST_POINTS or on_a_line(xy, SAME_PLACE_M):
             return None
         low, high = xy.min(axis=0) - self.spacing_m / 2, xy.max(axis=0) + self.spacing_m / 2
         box = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
@@ -319,11 +320,6 @@ def _cell(result: PointResult) -> _Cell:
     known = all(map(math.isfinite, place))
     x, y, z = (math.floor(x / SAME_PLACE_M) if known else math.nan for x in place)
     return result.frame_id, x, y, z
-
-
-def _on_a_line(xy_m: FloatArray) -> bool:
-    """Whether (n, 2) positions are on one line: nothing is known beside it."""
-    return bool(np.linalg.matrix_rank(xy_m - xy_m.mean(axis=0), tol=SAME_PLACE_M) < 2)
 
 
 def tangent_axes(normal: FloatArray) -> FloatArray:
