@@ -62,12 +62,12 @@ class Setup:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``bench.md`` and ``bench.png`` into `output`, and return the table.
+    """Measure, draw ``bench.png`` into `output`, and return the page.
 
     Parameters
     ----------
     output : Path
-        Folder for the results; made if absent.
+        Folder for the figure.
     quick : bool
         Few repetitions: shows that everything works, figures are rough.
     """
@@ -75,8 +75,6 @@ def run(output: Path, quick: bool) -> str:
     timing = measure_timing(setup, 3 if quick else 12)
     linear, spectra, errors = measure_accuracy(setup, 2 if quick else 12)
     text = _report(timing, linear, errors)
-    output.mkdir(parents=True, exist_ok=True)
-    (output / "bench.md").write_text(text, encoding="utf-8")
     _draw(timing, spectra, output / "bench.png")
     return text
 

@@ -29,7 +29,6 @@ from benchmarks.calibrate_benches import (
 from benchmarks.calibrate_decision import Called, decide_point, tasks
 from benchmarks.skip_decision import INSIDE, TISSUES
 from tactile_resonance.calibration.contact import ContactStatus
-from tactile_resonance.files import write_whole
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
 from tactile_resonance.simulation.sensor.bimorph import couple
@@ -49,7 +48,7 @@ PREFACE = (
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``calibrate.md`` and ``calibrate.png`` into `output`, and return the page."""
+    """Measure, draw ``calibrate.png`` into `output`, and return the page."""
     benches, repeats, points = (4, 2, 400) if quick else (50, 4, 10_000)
     context = get_context("fork")
     with ProcessPoolExecutor(PROCESSES, mp_context=context) as pool:
@@ -93,7 +92,6 @@ def run(output: Path, quick: bool) -> str:
             "",
         ]
     )
-    write_whole(output / "calibrate.md", page.encode())
     return page
 
 

@@ -59,7 +59,7 @@ class Cell:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure; write ``cell.md``; return its text."""
+    """Measure; return the page."""
     seconds, repeats = (5.0, 3) if quick else (60.0, 20)
     cell = Cell()
     try:
@@ -70,7 +70,6 @@ def run(output: Path, quick: bool) -> str:
         text = _stream(config, cell, seconds) + _faults(config, cell, repeats)
     finally:
         cell.end()
-    (output / "cell.md").write_text(text, encoding="utf-8")
     return text
 
 

@@ -75,12 +75,12 @@ def cases(full: bool) -> list[Case]:
 
 
 def run(output: Path, quick: bool, full: bool = False) -> str:
-    """Measure, write ``contact.md`` and ``contact.png`` into `output`, and return the table.
+    """Measure, draw ``contact.png`` into `output`, and return the page.
 
     Parameters
     ----------
     output : Path
-        Folder for the results; made if absent.
+        Folder for the figure.
     quick : bool
         Few cases: shows that everything works, figures are rough.
     full : bool
@@ -104,8 +104,6 @@ def run(output: Path, quick: bool, full: bool = False) -> str:
     series = contact_series(1000 if full else 20 if quick else 60)
     peaks = stiff_peaks(10 if quick else 60)
     text = _report(outcomes, series, peaks, drivers, len(chosen)) + "\n" + living
-    output.mkdir(parents=True, exist_ok=True)
-    (output / "contact.md").write_text(text, encoding="utf-8")
     _draw(outcomes, series, chosen, output / "contact.png")
     return text
 

@@ -22,7 +22,6 @@ import numpy as np
 
 from benchmarks.skip_hands import VirtualHands
 from tactile_resonance.commands.report import report_run
-from tactile_resonance.files import write_whole
 from tactile_resonance.scan.map_messages import cloud_message, marker_message, surface_message
 from tactile_resonance.scan.messages import header_message, message_types, to_cdr
 from tactile_resonance.scan.plan import make_plan
@@ -193,7 +192,7 @@ def drawn_ms(pole_map: PoleMap) -> Iterator[float]:
 
 
 def run(output: Path, quick: bool, points: int = POINTS) -> str:
-    """Scan, resume, read, report; write ``endurance.md`` into `output`, and return the page."""
+    """Scan, resume, read, report; return the page."""
     with TemporaryDirectory() as folder, ExitStack() as stack:
         path, target = Path(folder) / "scene.yaml", Path(folder) / "run"
         text = dump_yaml(content(points))
@@ -233,7 +232,6 @@ def run(output: Path, quick: bool, points: int = POINTS) -> str:
             clocks_s += [time.perf_counter() - begun_s, time.process_time() - begun_cpu_s]
             print(clocks_s, flush=True)
     page = _page(course.parts, size_mb, clocks_s, quick)
-    write_whole(output / "endurance.md", page.encode())
     return page
 
 

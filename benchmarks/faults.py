@@ -27,10 +27,10 @@ from benchmarks.faults_session import (
     Row,
     session_rows,
 )
+from tactile_resonance.commands.benchmark import write_page
 from tactile_resonance.processes import free_domain_id
 
 RESULTS = "faults.json"
-PAGE = "reliability.md"
 HEAD = f"""# Reliability
 
 What becomes of a scan when something goes wrong. Simulated: real nodes as processes, a simulated robot,
@@ -103,9 +103,9 @@ def run(output: Path, quick: bool, row: str = "") -> str:
         keep(made)
     found = [Row(**known[name]) for name in names if name in known]
     page = _page(found, [name for name in names if name not in known])
-    (output.parent / PAGE).write_text(page, encoding="utf-8")
     wrong = [f"{each.name}: {each.wrong}" for each in found if each.wrong and each.name in wanted]
     if wrong:
+        write_page(output, "faults", page)
         raise ValueError("benchmark faults: " + "; ".join(wrong))
     return page
 

@@ -271,7 +271,7 @@ def _tried_apart(every: Sequence[Target], inputs: int, folder: Path) -> list[Ans
 
 
 def run(output: Path, quick: bool, full: bool = False) -> str:
-    """Try all readers, write ``hostile.md`` and inputs with a wrong answer into `output`; return the page."""
+    """Try all readers, write inputs with a wrong answer into `output`; return the page."""
     inputs = FULL_INPUTS if full else QUICK_INPUTS if quick else INPUTS
     with TemporaryDirectory() as folder:
         every = [*targets(Path(folder)), *wire_targets()]
@@ -283,7 +283,6 @@ def run(output: Path, quick: bool, full: bool = False) -> str:
             name = re.sub(r"\W+", "-", of.name)
             (output / f"hostile-{name}-{k}.bin").write_bytes(data)
     text = _page(done, flips)
-    (output / "hostile.md").write_text(text, encoding="utf-8")
     return text
 
 

@@ -16,7 +16,6 @@ import tempfile
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +23,7 @@ import numpy as np
 
 from benchmarks.processor import fft_s, loop_s
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.commands.options import require_packages
 from tactile_resonance.configuration import share_path
 from tactile_resonance.processes import free_domain_id, may_take_priority
 from tactile_resonance.simulation.plant.defaults import PRIORITY
@@ -42,16 +42,14 @@ QUICK_SCENE = Path(".ci/two_points.yaml")
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``live.md`` into `output`, and return the page.
+    """Measure; return the page.
 
     Raises
     ------
     ValueError
         Where what a scan needs is not there.
     """
-    for package in ("rclpy", "tactile_resonance.msg", "rtde_control", "can"):
-        if find_spec(package) is None:
-            raise ValueError(f"benchmark live: {package} not found; tools/run.sh sets it up")
+    require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can")
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     seconds = 5.0 if quick else 20.0
     scene = QUICK_SCENE.resolve() if quick else share_path("config/scenes/demo.yaml")
@@ -70,8 +68,6 @@ def run(output: Path, quick: bool) -> str:
         shares[f"two scans at once: {k}"] = scan.shares
     speeds.append(_speed())
     text = _report(shares, lost, (one, *two), seconds, scene, np.concatenate(speeds))
-    output.mkdir(parents=True, exist_ok=True)
-    (output / "live.md").write_text(text, encoding="utf-8")
     return text
 
 

@@ -30,6 +30,7 @@ from benchmarks.load_case import (
     findings,
 )
 from benchmarks.processor import fft_s, loop_s
+from tactile_resonance.commands.benchmark import write_page
 from tactile_resonance.configuration import share_path
 from tactile_resonance.processes import free_domain_id
 
@@ -54,7 +55,7 @@ QUICK_SCENE = Path(".ci/two_points.yaml")
 
 
 def run(output: Path, quick: bool) -> str:
-    """Run all of it, write ``load.md`` into `output`, and return the page.
+    """Run all of it; return the page.
 
     Raises
     ------
@@ -78,8 +79,8 @@ def run(output: Path, quick: bool) -> str:
         moments = 3 if quick else INTERRUPTIONS
         wrong += _interrupted(folder, scene, np.linspace(0.3, 1.1 * idle.seconds, moments))
     page = _page(rows, wrong, scene, moments)
-    (output / "load.md").write_text(page, encoding="utf-8")
     if wrong:
+        write_page(output, "load", page)
         raise ValueError("benchmark load: " + "; ".join(wrong))
     return page
 

@@ -168,13 +168,12 @@ def bench_tests() -> list[TissueTest]:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Table and figure."""
+    """Page and figure."""
     count = 60 if quick else 300
     with ProcessPoolExecutor(2) as pool:
         cases = list(tqdm(pool.map(case_of, range(count), chunksize=4), total=count))
     tests = bench_tests()
     text = _page(cases, tests)
-    (output / "mechanics.md").write_text(text, encoding="utf-8")
     save_figure(draw_tests(tests, "Relaxation on the bench, rigid ball"), output / "mechanics.png")
     return text
 

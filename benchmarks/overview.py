@@ -77,7 +77,7 @@ class Scaling:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``README.md``, ``overview.json`` and ``overview.png`` into `output`; the page.
+    """Measure, write ``overview.json`` and ``overview.png`` into `output`; return the page.
 
     Raises
     ------
@@ -88,10 +88,8 @@ def run(output: Path, quick: bool) -> str:
     values = [*_frf_values(quick), *_pole_values(methods), *_coverage(), *_decision(), *_stability()]
     scalings = _scalings(2 if quick else ROUNDS)
     worse = _worse(values)
-    output.mkdir(parents=True, exist_ok=True)
     pages = [name for name in NAMES if (output / f"{name}.md").exists()]
     text = _page(values, methods, scalings, worse, pages)
-    (output / "README.md").write_text(text, encoding="utf-8")
     kept = {of.name: round(of.value, 6) for of in values}
     (output / "overview.json").write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
     _draw(methods, scalings, output / "overview.png")

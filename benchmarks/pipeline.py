@@ -12,13 +12,13 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 from tactile_resonance._typing import FloatArray, IntArray
+from tactile_resonance.commands.options import require_packages
 from tactile_resonance.processes import NodeProcesses, free_domain_id
 
 NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node")
@@ -80,24 +80,20 @@ class Latencies:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``pipeline.md`` and ``pipeline.png`` into `output`, and return the table.
+    """Measure, draw ``pipeline.png`` into `output`, and return the page.
 
     Raises
     ------
     ValueError
         Where ROS 2 or the messages are not there.
     """
-    for package in ("rclpy", "tactile_resonance.msg"):
-        if find_spec(package) is None:
-            raise ValueError(f"benchmark pipeline: {package} not found; tools/run.sh sets it up")
+    require_packages("rclpy", "tactile_resonance.msg")
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     measurements = 4 if quick else 20
     raised = _may_take_precedence()
     results = {name: measure(goal, measurements, raised) for name, goal in CASES.items()}
     text = _report(results, raised)
-    output.mkdir(parents=True, exist_ok=True)
-    (output / "pipeline.md").write_text(text, encoding="utf-8")
     _draw(results, output / "pipeline.png")
     return text
 

@@ -45,18 +45,17 @@ PARTS = ("methods", "bias", "grid", "realisations", "reidentify")
 
 
 def run(output: Path, quick: bool, part: str | None = None) -> str:
-    """Write the figure and the tables.
+    """Draw the figure; return the page.
 
     Parameters
     ----------
     output : Path
-        Folder, made if need be.
+        Folder of the figure, and of the page before.
     quick : bool
         A thinned Monte Carlo: 500 runs a cell instead of 20 000, of realisations instead of 3000.
     part : {"methods", "bias", "grid", "realisations", "reidentify"}, optional
         Renew this table alone, the others stay as they are in `output`. All when absent.
     """
-    output.mkdir(parents=True, exist_ok=True)
     page = output / "poles.md"
     sections = [_heading(quick), *([] for _ in PARTS)]
     if part is not None:
@@ -66,7 +65,6 @@ def run(output: Path, quick: bool, part: str | None = None) -> str:
         if part in (None, name):
             sections[k] = _measured(name, output, quick)
     text = "\n".join(line for section in sections for line in section) + "\n"
-    page.write_text(text, encoding="utf-8")
     return text
 
 

@@ -20,9 +20,7 @@ TISSUES = ("gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver")
 PERIODS = 8
 
 
-def tissue_bias(
-    structures: Sequence[ModelStructure], tissues: Sequence[str] = TISSUES
-) -> dict[str, list[FloatArray]]:
+def tissue_bias(structures: Sequence[ModelStructure]) -> dict[str, list[FloatArray]]:
     """Error of noise-free fits over the noise standard deviation of noisy ones.
 
     Returns
@@ -45,7 +43,7 @@ def tissue_bias(
         for structure in structures
     ]
     result: dict[str, list[FloatArray]] = {}
-    for name in tissues:
+    for name in TISSUES:
         records = []
         for effects in (BenchEffects.none(), BenchEffects()):
             run = bench.start(library[name], seed=0, effects=effects)

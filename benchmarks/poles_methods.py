@@ -57,12 +57,10 @@ class Contestant:
     estimates: Callable[[Any], FloatArray] | None = None
 
 
-def joint_plan(
-    plant: Plant, structure: ModelStructure = BARE, kind: type[JointPlan] = JointPlan
-) -> JointPlan:
+def joint_plan(plant: Plant, structure: ModelStructure = BARE) -> JointPlan:
     """Joint estimator for a plant."""
     variance_y, variance_u = plant.noise
-    return kind(
+    return JointPlan(
         SAMPLE_RATE_HZ,
         SAMPLES_PER_PERIOD,
         plant.periods,

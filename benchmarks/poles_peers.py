@@ -76,15 +76,7 @@ def least_squares_peer(case: Case) -> Estimator:
     def estimate(k: int) -> tuple[float, float]:
         g, std = case.g[k], np.sqrt(case.variance[k])
         design = np.stack([np.ones_like(s), s, s**2, -g, -g * s], -1)
-        right = g * s**2
-        start = np.linalg.lstsq(
-            np.concatenate([design.real, design.imag]),
-            np.concatenate([right.real, right.imag]),
-            rcond=None,
-        )[0]
-        theta = least_squares(residual, start, args=(g, std), method="lm", x_scale="jac").x
-        w0 = np.sqrt(theta[3])
-        return 250 * w0, theta[4] / (2 * w0)
+        return _pole(residual, design, g * s**2, (g, std))
 
     return estimate
 
@@ -108,17 +100,23 @@ def joint_least_squares_peer(case: Case) -> Estimator:
         one = np.ones_like(s)
         u_k, y_k = np.where(excited, u[k], 0), y[k]
         design = np.stack([u_k, u_k * s, u_k * s**2, -y_k, -y_k * s, one, s], -1)
-        right = y_k * s**2
-        start = np.linalg.lstsq(
-            np.concatenate([design.real, design.imag]),
-            np.concatenate([right.real, right.imag]),
-            rcond=None,
-        )[0]
-        theta = least_squares(residual, start, args=(u_k, y_k), method="lm", x_scale="jac").x
-        w0 = np.sqrt(theta[3])
-        return 250 * w0, theta[4] / (2 * w0)
+        return _pole(residual, design, y_k * s**2, (u_k, y_k))
 
     return estimate
+
+
+def _pole(
+    residual: Callable, design: npt.NDArray, right: npt.NDArray, data: tuple[npt.NDArray, ...]
+) -> tuple[float, float]:
+    """f0 [Hz] and damping ratio of least squares that begin at the linear solution of `design`."""
+    start = np.linalg.lstsq(
+        np.concatenate([design.real, design.imag]),
+        np.concatenate([right.real, right.imag]),
+        rcond=None,
+    )[0]
+    theta = least_squares(residual, start, args=data, method="lm", x_scale="jac").x
+    w0 = np.sqrt(theta[3])
+    return 250 * w0, theta[4] / (2 * w0)
 
 
 def aaa_peer(case: Case) -> Estimator:

@@ -19,7 +19,6 @@ from benchmarks.skip_decision import AGES_S, FORCE_STD_N, PREPARATION_PERCENT
 from benchmarks.skip_point import SimulatedPoint
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.configuration import share_path
-from tactile_resonance.files import write_whole
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
@@ -232,7 +231,7 @@ def share(which: BoolArray) -> str:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``references.md`` and ``references.png`` into `output`, and return the page."""
+    """Measure, draw ``references.png`` into `output`, and return the page."""
     count = QUICK if quick else Count()
     castings = CASTINGS * count.libraries
     with ProcessPoolExecutor(PROCESSES, mp_context=get_context("fork")) as pool:
@@ -276,7 +275,6 @@ def run(output: Path, quick: bool) -> str:
         ]
     )
     save_figure(_draw(points, strange, bins), output / "references.png")
-    write_whole(output / "references.md", page.encode())
     return page
 
 

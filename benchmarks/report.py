@@ -20,13 +20,13 @@ import threading
 import time
 import urllib.request
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.processor import cpu_s, loop_s
+from tactile_resonance.commands.options import require_packages
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.report.point_details import detailed, details_of, truths_with
 from tactile_resonance.report.run_report import as_page, pole_maps_of
@@ -42,16 +42,14 @@ _COMMAND = (sys.executable, "-m", "tactile_resonance.cli")
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``report.md`` into `output`, and return the page.
+    """Measure; return the page.
 
     Raises
     ------
     ValueError
         Where what a scan needs is not there.
     """
-    for package in ("rclpy", "tactile_resonance.msg", "rtde_control", "can", "plotly"):
-        if find_spec(package) is None:
-            raise ValueError(f"benchmark report: {package} not found; tools/run.sh sets it up")
+    require_packages("rclpy", "tactile_resonance.msg", "rtde_control", "can", "plotly")
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     speed_s = loop_s()
@@ -63,7 +61,6 @@ def run(output: Path, quick: bool) -> str:
         if not quick:
             rows.append(_written(_many(content), speed_s, content))
     text = _page(rows, watched, speed_s, scan[0])
-    (output / "report.md").write_text(text, encoding="utf-8")
     return text
 
 

@@ -66,7 +66,7 @@ class LinkResult:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``robot.md`` and ``robot.png`` into `output`, and return the table.
+    """Measure, draw ``robot.png`` into `output`, and return the page.
 
     Raises
     ------
@@ -97,8 +97,6 @@ def run(output: Path, quick: bool) -> str:
     if not results:
         raise ValueError(f"benchmark robot: no run came to its end; {failures}")
     text = _report(results, failures, seconds)
-    output.mkdir(parents=True, exist_ok=True)
-    (output / "robot.md").write_text(text, encoding="utf-8")
     _draw(results, output / "robot.png")
     return text
 

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from benchmarks import skip_decision, skip_time, skip_touches
 from benchmarks.skip_hands import Scanned, scan
 from tactile_resonance.configuration import share_path
-from tactile_resonance.files import write_whole
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.scan.adaptive import Adaptive, WantedBoundary, known_points
 from tactile_resonance.scan.level_set import difference_m2
@@ -61,7 +60,7 @@ class Case:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``skip.md`` and ``skip.png`` into `output`, and return the page."""
+    """Measure, draw ``skip.png`` into `output`, and return the page."""
     whole_s, short_s = (_overhead_s(skip_time.SKIPPINGS[name]) for name in ("nothing", "both"))
     cases = _cases(quick)
     found = {name: _both(case, whole_s, short_s) for name, case in cases.items()}
@@ -106,7 +105,6 @@ def run(output: Path, quick: bool) -> str:
             "",
         ]
     )
-    write_whole(output / "skip.md", page.encode())
     return page
 
 

@@ -74,49 +74,27 @@ class PointTimes:
         return np.sum(list(self.phases_s.values()), axis=0)
 
 
-def grid(side: int = SIDE, spacing_m: float = SPACING_M) -> list[ScanPoint]:
+def grid() -> list[ScanPoint]:
     """Points of a square in serpentine order, as in the demo."""
     places = []
-    for row in range(side):
-        along = [(column * spacing_m, row * spacing_m, 0.0) for column in range(side)]
+    for row in range(SIDE):
+        along = [(column * SPACING_M, row * SPACING_M, 0.0) for column in range(SIDE)]
         places += along if row % 2 == 0 else along[::-1]
     return [ScanPoint(index, place, UP, TURN) for index, place in enumerate(places)]
 
 
-def point_times(
-    skipping: Skipping,
-    points: list[ScanPoint] | None = None,
-    *,
-    blocks_s: float = BLOCKS_S,
-    height_m: float = 0.0,
-    tilt_rad: float = 0.0,
-    tissue: str = "",
-    seed: int = 1,
-) -> PointTimes:
-    """Contacts at all points, each held for its blocks.
-
-    Parameters
-    ----------
-    skipping : Skipping
-    points : list of ScanPoint, optional
-        On the plane z = 0, on which the surface is expected; by default those of `grid`.
-    blocks_s : float
-    height_m, tilt_rad : float
-        By which the surface lies above and is tilted against that plane.
-    tissue : str
-        Of the library; empty: 10 % gelatine.
-    seed : int
-    """
-    points = grid() if points is None else points
+def point_times(skipping: Skipping, seed: int = 1) -> PointTimes:
+    """Contacts with 10 % gelatine at all points of `grid`, each held for its blocks."""
+    points = grid()
     parameters, limits = read_contact()
     if not skipping.tare:
         parameters = replace(parameters, zero_std_n=0.0)
-    sensor, library = read_sensor(), read_tissues()
+    sensor = read_sensor()
     radius_m = sensor.tip.radius_m
     touches = [touch_pose(p.position_m, UP, [1.0, 0.0, 0.0], radius_m) for p in points]
     bench = ContactBench(
-        library[tissue] if tissue else library.gelatine(10.0),
-        FlatSurface.tilted(height_m, tilt_rad),
+        read_tissues().gelatine(10.0),
+        FlatSurface.tilted(0.0, 0.0),
         Pose(touches[0].position_m + [0, 0, START_M], touches[0].rotation_rad),
         tip=Tip(radius_m, sensor_modes(sensor)),
         seed=seed,
@@ -144,7 +122,7 @@ def point_times(
         if not result.reached:
             raise RuntimeError(f"point {point.index + 1}: {result.cause.value}: {result.message}")
         standoffs.add(point, result.surface_m, result.surface_std_m)
-        loop.run_while(lambda: controller.state is State.HOLD, blocks_s)
+        loop.run_while(lambda: controller.state is State.HOLD, BLOCKS_S)
         loop.retract()
     phases_s = {
         phase: parameters.period_s * np.array([each[phase] for each in spent]) for phase in PHASES

@@ -84,12 +84,11 @@ def _right(cell: Cell, fits: PolesBatch, run: int) -> bool:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Fit all cells, write ``stability.md`` and ``stability.png`` into `output`, and return the page."""
+    """Fit all cells, draw ``stability.png`` into `output`, and return the page."""
     rng = np.random.default_rng(1)
     every = cells(QUICK_ORDER) if quick else cells()
     outcomes = [outcome(cell, rng, QUICK_RUNS if quick else RUNS) for cell in every]
     text = _page(outcomes)
-    (output / "stability.md").write_text(text, encoding="utf-8")
     _draw(outcomes, output / "stability.png")
     return text
 

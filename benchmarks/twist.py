@@ -61,7 +61,7 @@ class Lab:
 
 
 def run(output: Path, quick: bool) -> str:
-    """Measure, write ``twist.md`` into `output`, and return it."""
+    """Measure; return the page."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     contacts = 2 if quick else 12
     rows: dict[str, list[Held | str]] = {}
@@ -76,8 +76,6 @@ def run(output: Path, quick: bool) -> str:
         parameters = ContactParameters(period_s=1 / rate_hz, **KNOWN)
         virtual[rate_hz] = [run_controller(case, REFERENCE, parameters) for case in grid]
     text = _report(rows, virtual, contacts)
-    output.mkdir(parents=True, exist_ok=True)
-    (output / "twist.md").write_text(text, encoding="utf-8")
     return text
 
 

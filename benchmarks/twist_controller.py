@@ -10,6 +10,10 @@ import numpy as np
 from tactile_resonance.contact.samples import CellSample, Pose
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 
+TIMEOUT_NS = 50_000_000
+"""A command older than this counts no more."""
+ACCELERATION_M_S2 = 2.0
+
 
 class TwistController:
     """Follows the newest twist, under a limit of acceleration; zero where none has come for a while.
@@ -19,9 +23,6 @@ class TwistController:
     bench : ContactBench
     rate_hz : float
         Of its steps; a whole number of the bench's periods each.
-    timeout_s : float
-        A command older than this counts no more [s].
-    acceleration_m_s2 : float
 
     Attributes
     ----------
@@ -35,19 +36,11 @@ class TwistController:
         Of the tip in the base at the same times [m].
     """
 
-    def __init__(
-        self,
-        bench: ContactBench,
-        rate_hz: float,
-        *,
-        timeout_s: float = 0.05,
-        acceleration_m_s2: float = 2.0,
-    ) -> None:
+    def __init__(self, bench: ContactBench, rate_hz: float) -> None:
         self.active = True
         self.force_n: list[tuple[float, float]] = []
         self.height_m: list[float] = []
         self._bench, self._period_ns = bench, round(1e9 / rate_hz)
-        self._timeout_ns, self._acceleration_m_s2 = round(1e9 * timeout_s), acceleration_m_s2
         self._commanded_ns, self._twist = 0, np.zeros(6)
         self.wrenches: list[CellSample] = []
         bench.clock.on_step.append(self._record)
@@ -69,10 +62,10 @@ class TwistController:
 
     def step(self) -> None:
         """Go on by one step."""
-        late = self.time_ns - self._commanded_ns > self._timeout_ns
+        late = self.time_ns - self._commanded_ns > TIMEOUT_NS
         twist = np.zeros(6) if late or not self.active else self._twist
         clock = self._bench.clock
-        clock.motion.speed(twist, self._acceleration_m_s2)
+        clock.motion.speed(twist, ACCELERATION_M_S2)
         clock.wait_until(clock.time_ns + self._period_ns)
         self.wrenches = self._bench.cell.read()
 

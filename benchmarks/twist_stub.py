@@ -43,8 +43,6 @@ class TwistStub:
     Parameters
     ----------
     rate_hz : float
-    tissue : str
-    seed : int
 
     Attributes
     ----------
@@ -55,16 +53,16 @@ class TwistStub:
         Stamp [s] and twist of every command that was answered with a step.
     """
 
-    def __init__(self, rate_hz: float, tissue: str = "gel10", seed: int = 1) -> None:
+    def __init__(self, rate_hz: float) -> None:
         sensor = read_sensor()
         self._tissues = read_tissues()
         start = Pose.from_vector(np.array(TABLE_IN_BASE))
         bench = ContactBench(
-            self._tissues[tissue],
+            self._tissues["gel10"],
             FlatSurface(np.array(TABLE_IN_BASE[:3]), np.array([0.0, 0.0, 1.0])),
             Pose(start.position_m + [0.0, 0.0, CLEAR_M], start.rotation_rad),
             tip=Tip(sensor.tip.radius_m, sensor_modes(sensor)),
-            seed=seed,
+            seed=1,
         )
         self._plant = bench.plant
         self.controller = TwistController(bench, rate_hz)

@@ -8,6 +8,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+from tactile_resonance.files import write_whole
+
 NAMES = (
     *("frf", "poles", "bench", "contact", "touch", "robot"),
     *("twist", "cell", "recording", "pipeline", "live", "load"),
@@ -18,6 +20,10 @@ WITH_FULL = ("contact", "hostile")
 """Those with a larger grid than they run by default."""
 PARTS = ("methods", "bias", "grid", "realisations", "reidentify")
 """Tables of `poles`, each of which can be renewed alone."""
+
+
+PAGES = {"overview": "README.md", "faults": "../reliability.md"}
+"""Of a benchmark, where it is another than that of its name."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -56,7 +62,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run one or all; each prints its table and writes table and figure."""
+    """Run one or all: page and figure of each are written, and the page printed."""
     if find_spec("benchmarks") is None:
         raise ValueError(
             "benchmark: no benchmarks found, run it from the source tree: tools/run.sh"
@@ -78,5 +84,12 @@ def run(options: argparse.Namespace) -> int:
             extra["part"] = options.part
         if options.row is not None:
             extra["row"] = options.row
-        print(import_module(f"benchmarks.{name}").run(options.output, options.quick, **extra))
+        page = import_module(f"benchmarks.{name}").run(options.output, options.quick, **extra)
+        write_page(options.output, name, page)
+        print(page)
     return 0
+
+
+def write_page(output: Path, name: str, page: str) -> None:
+    """Write what a benchmark returned; it calls this itself before it fails for what the page states."""
+    write_whole(output / PAGES.get(name, f"{name}.md"), page.encode())
