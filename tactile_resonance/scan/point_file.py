@@ -82,13 +82,13 @@ def offered_qos(depth: int, *, reliable: bool = True, latched: bool = False) -> 
 class TopicContent:
     """One topic of a file; `type_hash` (REP-2011) is that of the definition in the file.
 
-    `qos` is what its publisher offered; None: not recorded.
+    `qos` is what its publisher offered, as JSON: a list of at most one, as rosbag2 has it.
     """
 
     name: str
     type_name: str
     type_hash: str
-    qos: Qos | None
+    qos: str
     count: int
 
 
@@ -251,7 +251,8 @@ def read_content(path: Path) -> FileContent:
 
 def _topic_of(connection: Connection, type_hash: str, count: int) -> TopicContent:
     assert isinstance(connection.ext, ConnectionExtRosbag2)
-    qos = next(iter(connection.ext.offered_qos_profiles), None)
+    offered = dump_qos_v9(list(connection.ext.offered_qos_profiles)[:1])
+    qos = json.dumps(offered, separators=(",", ":"))
     return topic_content(connection.topic, connection.msgtype, type_hash, qos, count)
 
 
@@ -358,7 +359,7 @@ def _topic(topic: TopicContent) -> dict[str, Any]:
             "name": topic.name,
             "type": topic.type_name,
             "serialization_format": "cdr",
-            "offered_qos_profiles": dump_qos_v9([] if topic.qos is None else [topic.qos]),
+            "offered_qos_profiles": json.loads(topic.qos),
             "type_description_hash": topic.type_hash,
         },
         "message_count": topic.count,

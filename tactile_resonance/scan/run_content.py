@@ -15,18 +15,16 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import astuple, dataclass, replace
+from functools import cached_property
 from itertools import repeat
 from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-from rosbags.interfaces import Qos
-from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from rosbags.serde import SerdeError
 
-from tactile_resonance.fields import counted, read_dataclass
+from tactile_resonance.fields import counted, read_dataclass, whole
 from tactile_resonance.files import write_whole
 from tactile_resonance.scan.messages import definition_and_hash, message_types
 from tactile_resonance.scan.point_file import (
@@ -46,7 +44,6 @@ POINT_FILE = re.compile(r"point-(\d{5})-(\d{2,})\.mcap")
 CHECKSUM = "crc32"
 """Field of ``run.json``."""
 PLAN_DAMAGED = "run.json: differs from what was written (checksum)"
-_PART_BYTES = 1 << 20
 _NAME = re.compile(r"(?:recording/)?([\w-]{1,200}\.(?:mcap|yaml))")
 
 
@@ -290,23 +287,14 @@ class Entry:
         size = path.stat().st_size
         if size != self.size:
             return f"has {size} bytes, {self.size} when it was finished"
-        return "" if crc32_of(path) == self.crc32 else "differs from what was finished (checksum)"
+        return "" if crc32(path.read_bytes()) == self.crc32 else "differs from what was finished (checksum)"
 
 
 def entry_of(
     path: Path, name: str, content: FileContent | None = None, message: bytes = b""
 ) -> Entry:
     """Entry of a file that is complete; arguments as the fields of `Entry`."""
-    return Entry(name, path.stat().st_size, crc32_of(path), content, message)
-
-
-def crc32_of(path: Path) -> int:
-    """CRC-32 of a file's bytes."""
-    found = 0
-    with path.open("rb") as file:
-        while part := file.read(_PART_BYTES):
-            found = crc32(part, found)
-    return found
+    return Entry(name, path.stat().st_size, crc32(path.read_bytes()), content, message)
 
 
 def append_entry(run: Path, entry: Entry) -> None:
@@ -351,10 +339,7 @@ def read_index(run: Path) -> tuple[dict[str, Entry], list[str]]:
 def _line(entry: Entry) -> bytes:
     fields: dict[str, Any] = {"name": entry.name, "size": entry.size, "crc32": entry.crc32}
     if (content := entry.content) is not None:
-        topics = [
-            [t.name, t.type_name, t.type_hash, _qos_text(t.qos), t.count] for t in content.topics
-        ]
-        fields["content"] = [content.name, content.start_ns, content.end_ns, topics]
+        fields["content"] = astuple(content)
     if entry.message:
         fields["point_result"] = base64.b64encode(entry.message).decode()
     text = json.dumps(fields, separators=(",", ":")).encode()
@@ -368,25 +353,14 @@ def _entry(fields: Mapping[str, Any]) -> Entry:
     content = None
     if "content" in fields:
         _, start_ns, end_ns, topics = fields["content"]
-        times_ns = _whole(start_ns), _whole(end_ns)
+        times_ns = whole(start_ns, "start_ns"), whole(end_ns, "end_ns")
         content = FileContent(match[1], *times_ns, tuple(_topic(*topic) for topic in topics))
     message = base64.b64decode(fields.get("point_result", ""))
-    return Entry(fields["name"], _whole(fields["size"]), _whole(fields["crc32"]), content, message)
+    size, crc = (whole(fields[name], name) for name in ("size", "crc32"))
+    return Entry(fields["name"], size, crc, content, message)
 
 
-def _whole(value: object) -> int:
-    if type(value) is not int or not 0 <= value < 1 << 64:
-        raise ValueError(f"no whole number: {value!r}")
-    return value
-
-
-def _qos_text(qos: Qos | None) -> str:
-    return json.dumps([] if qos is None else dump_qos_v9([qos]), separators=(",", ":"))
-
-
-@cache
 def _topic(name: str, type_name: str, type_hash: str, qos: str, count: int) -> TopicContent:
-    if not all(isinstance(text, str) for text in (name, type_name, type_hash)):
+    if not all(isinstance(text, str) for text in (name, type_name, type_hash, qos)):
         raise TypeError("topic: no texts")
-    offered = next(iter(parse_qos(json.loads(qos))), None)
-    return topic_content(name, type_name, type_hash, offered, _whole(count))
+    return topic_content(name, type_name, type_hash, qos, whole(count, "count"))

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader, ReaderError
 from tactile_resonance.scan import point_file
 from tactile_resonance.scan.point_result import PointKind
 from tactile_resonance.scan.recorded import recorded_results
-from tactile_resonance.scan.run_content import INDEX, crc32_of, read_run
+from tactile_resonance.scan.run_content import INDEX, entry_of, read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -240,4 +240,4 @@ def test_a_result_of_another_point_in_the_index_is_named(tmp_path):
 def test_checksum_is_that_of_other_tools(tmp_path):
     """The check value of CRC-32/ISO-HDLC (Williams, A painless guide to CRC error detection, 1993)."""
     (tmp_path / "file").write_bytes(b"123456789")
-    assert crc32_of(tmp_path / "file") == 0xCBF43926
+    assert entry_of(tmp_path / "file", "file").crc32 == 0xCBF43926
