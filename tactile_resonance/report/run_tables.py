@@ -184,8 +184,8 @@ def time_table(results: Sequence[PointResult]) -> str:
     for name, each in {**budget, "all": np.sum(list(budget.values()), axis=0)}.items():
         figures = (np.median(each), each.max(), each.sum())
         texts = (f"{figure:.2f}" for figure in figures)
-        rows.append(_row("td", names, (name, *texts, f"{100 * each.sum() / whole_s:.0f}")))
-    return table(names, rows)
+        rows.append((name, *texts, f"{100 * each.sum() / whole_s:.0f}"))
+    return text_table(names, rows)
 
 
 def plan_table(scene: ScanScene | None, run: RunContent) -> str:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -248,22 +247,17 @@ def read_stl(path: Path) -> FloatArray:
         need = "trimesh, which reads STL: pip install trimesh"
         raise ValueError(f"file: got {path.name!r}; accepted with {need}") from error
     require(path.is_file(), "file", str(path), "a file that is there")
-    log = trimesh.util.log
+    log, quiet = trimesh.util.log, trimesh.util.log.disabled
     try:
-        log.addFilter(_nothing)  # of damaged files it logs tracebacks, which appear on stderr
+        log.disabled = True  # of damaged files it logs tracebacks, which appear on stderr
         mesh = trimesh.load_mesh(path, file_type="stl", process=False)
     except Exception as error:  # whatever its readers meet in a damaged file
         raise ValueError(f"file: {path} cannot be read as STL ({cut(str(error))})") from error
     finally:
-        log.removeFilter(_nothing)
+        log.disabled = quiet
     corners = np.asarray(mesh.triangles, float)
     require(len(corners) > 0, "file", str(path), "STL, binary or text, with a triangle or more")
     return corners
-
-
-def _nothing(_: logging.LogRecord) -> bool:
-    """Of a filter: no record passes."""
-    return False
 
 
 def _barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
