@@ -11,6 +11,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -171,16 +172,15 @@ class StoredMeasurement:
 
 @dataclass(frozen=True)
 class StoredEntry:
-    """One measurement of a store or a run: id, folder or file, the function that reads it, and its place."""
+    """One measurement of a store or a run: id, folder or file, what reads all readable of it, and its place.
+
+    `read` raises ValueError where nothing is readable, OSError where it cannot be listed.
+    """
 
     measurement_id: int
     path: Path
-    reader: Callable[[StoredEntry], StoredMeasurement]
+    read: Callable[[], StoredMeasurement]
     place: str = ""
-
-    def read(self) -> StoredMeasurement:
-        """Everything readable of it; ValueError where nothing is, OSError where it cannot be listed."""
-        return self.reader(self)
 
 
 def choose(entries: Sequence[StoredEntry], measurement_id: int | None, where: Path) -> StoredEntry:
@@ -207,34 +207,34 @@ def list_measurements(folder: Path) -> tuple[list[StoredEntry], list[str]]:
             found.append((int(match[1]), int(match[2]), path))
         else:
             problems.append(f"{path.name}: not a measurement of a store")
-    return [StoredEntry(key, path, _read) for _, key, path in sorted(found)], sorted(problems)
+    entries = [StoredEntry(key, path, partial(_read, path, key)) for _, key, path in sorted(found)]
+    return entries, sorted(problems)
 
 
-def _read(entry: StoredEntry) -> StoredMeasurement:
+def _read(folder: Path, measurement_id: int) -> StoredMeasurement:
     excitations: list[Excitation] = []
     records: list[Record] = []
     problems: list[str] = []
-    for path in sorted(entry.path.iterdir()):
+    for path in sorted(folder.iterdir()):
         name = path.name.removesuffix(PART)
         try:
             if match := _EXCITATION.fullmatch(name):
                 excitation = read_stored(path, Excitation)
                 found: tuple[int, ...] = (excitation.measurement_id, excitation.realisation)
-                _check_name(path, found, (entry.measurement_id, int(match[1])))
+                _check_name(path, found, (measurement_id, int(match[1])))
                 excitations.append(excitation)
             elif match := _RECORD.fullmatch(name):
                 record = read_stored(path, Record)
                 found = (record.origin.measurement_id, record.realisation, record.block_index)
-                _check_name(path, found, (entry.measurement_id, int(match[1]), int(match[2])))
+                _check_name(path, found, (measurement_id, int(match[1]), int(match[2])))
                 records.append(record)
             else:
                 raise ValueError(f"{path.name}: neither excitation nor record")
         except ValueError as error:
-            if (
-                name == path.name
-            ):  # else it was being written when its writer ended; nobody has seen it
-                problems.append(f"{entry.path.name}/{error}")
-    return StoredMeasurement.of(entry.measurement_id, excitations, records, problems)
+            # else it was being written when its writer ended; nobody has seen it
+            if name == path.name:
+                problems.append(f"{folder.name}/{error}")
+    return StoredMeasurement.of(measurement_id, excitations, records, problems)
 
 
 def _planned_bytes(excitation: Excitation) -> int:

@@ -25,7 +25,7 @@ from tactile_resonance.scan.map_messages import (
     surface_message,
 )
 from tactile_resonance.scan.messages import header_message, make_message, to_cdr
-from tactile_resonance.scan.point_file import PointFileWriter, offered_qos, read_messages_of_type
+from tactile_resonance.scan.point_file import PointFileWriter, offered_qos, read_messages
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap, counts
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.tissue.classify import UNKNOWN
@@ -121,7 +121,7 @@ def _write_frames(writer: PointFileWriter, run: RunContent) -> str:
         frame = _transform(base, frame_id, start_ns, vector(pose.position_m), turn)
         _write(writer, "/tf_static", start_ns, make_message(_TF, transforms=[frame]), _LATCHED)
     for path in run.paths(_POSE):
-        for time_ns, _, message in read_messages_of_type(path, _POSE):
+        for time_ns, _, message in read_messages(path, _POSE):
             at, turn = message.pose.position, message.pose.orientation
             position, quaternion = (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)
             tip = _transform(message.header.frame_id, _TIP_FRAME, time_ns, position, quaternion)

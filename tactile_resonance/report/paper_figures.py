@@ -23,7 +23,7 @@ from tactile_resonance.recording.store import recording_of
 from tactile_resonance.report.drawing import PROBABILITY, decibel, ellipse
 from tactile_resonance.report.page import listed, s_plane
 from tactile_resonance.report.point_details import FRF_TYPE, PointDetails
-from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.references import BEFORE, read_reference
@@ -108,7 +108,7 @@ def _responses(
     title = "FRF with its noise, by tissue (figure 5)"
     cases: dict[str, Any] = {}
     for path in run.paths(FRF_TYPE, reference=BEFORE)[:1]:
-        for _, _, message in read_messages_of_type(path, FRF_TYPE):
+        for _, _, message in read_messages(path, FRF_TYPE):
             cases["free air"] = message
     for name, results in list(classes.items())[:_MOST_CASES]:
         frfs = [(r, details[r.index].frf) for r in results if r.index in details]

@@ -21,7 +21,7 @@ from tactile_resonance.report.page import (
     pole_entry,
     poles_entries,
 )
-from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
 from tactile_resonance.scan.recorded import EXCITATION
 from tactile_resonance.scan.run_content import RunContent, file_of
@@ -138,7 +138,7 @@ def read_details(run: RunContent, result: PointResult) -> PointDetails:
     frf, poles, told, force = None, None, [], []
     types = (FRF_TYPE, POLES_TYPE, STATE_TYPE, EXCITATION)
     begun_ns: int | None = None
-    for time_ns, topic, message in read_messages_of_type(file_of(run.path, result), *types):
+    for time_ns, topic, message in read_messages(file_of(run.path, result), *types):
         if topic.endswith("/contact_state"):
             if begun_ns is not None and np.isfinite(message.force_n):
                 force.append((1e-9 * (time_ns - begun_ns), float(message.force_n)))
@@ -195,7 +195,7 @@ def truths_of(run: RunContent, known: Container[int] = ()) -> dict[int, PointTru
         done = result.simulated and result.outcome is PointOutcome.DONE
         if not done or result.index in known or result.index not in told_at:
             continue
-        messages = read_messages_of_type(file_of(run.path, result), POLES_TYPE)
+        messages = read_messages(file_of(run.path, result), POLES_TYPE)
         told = [poles_from_message(message) for _, _, message in messages]
         if truth := truth_of_point(told, result):
             truths[result.index] = truth

@@ -256,28 +256,19 @@ def _topic_of(connection: Connection, type_hash: str, count: int) -> TopicConten
     return topic_content(connection.topic, connection.msgtype, type_hash, qos, count)
 
 
-def read_messages(path: Path, topic: str) -> Iterator[tuple[int, str, Any]]:
-    """(time [ns], topic, message) of each message of a topic of one file, in order.
+def read_messages(path: Path, *type_names: str) -> Iterator[tuple[int, str, Any]]:
+    """(time [ns], topic, message) of each message of a type or of several of one file, in order.
 
-    Messages are read with the definitions in the file, see `scan.messages.reader_of`.
+    Messages are read with the definitions in the file, see `scan.messages.reader_of`; under whatever namespace.
 
     Raises
     ------
     ValueError
         If the file is damaged, or of a version whose messages cannot be read any more.
     """
-    return _read(path, lambda connection: connection.topic == topic)
-
-
-def read_messages_of_type(path: Path, *type_names: str) -> Iterator[tuple[int, str, Any]]:
-    """As `read_messages`, of all messages of a type or of several, under whatever namespace."""
-    return _read(path, lambda connection: connection.msgtype in type_names)
-
-
-def _read(path: Path, wanted: Callable[[Connection], bool]) -> Iterator[tuple[int, str, Any]]:
     try:
         with Reader(path) as reader:
-            connections = [connection for connection in reader.connections if wanted(connection)]
+            connections = [c for c in reader.connections if c.msgtype in type_names]
             read = {c.id: reader_of(c.msgtype, c.msgdef) for c in connections}
             if connections:
                 for connection, time_ns, cdr in reader.messages(connections=connections):

@@ -198,6 +198,11 @@ _OF_FIRST_BAND = tuple(
 _HEADER = ("time_ns", "frame_id")
 
 
+def is_poles(topic: str) -> bool:
+    """Whether messages of `POLES_TYPE` on a topic are estimates, not truths of a simulation."""
+    return topic.rsplit("/", 1)[-1] == "poles"
+
+
 def to_message(result: PointResult, poles: Any = None) -> Any:
     """Message as rosbags knows it, ready for `to_cdr`.
 

@@ -3,21 +3,24 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 from tactile_resonance.recording.messages import excitation_from_message, record_from_message
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.recording.store import StoredEntry, StoredMeasurement, choose, recording_of
-from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import (
     POLES_TYPE,
     TYPE,
     PointResult,
     from_message,
+    is_poles,
     serialised,
 )
 from tactile_resonance.scan.run_content import (
@@ -48,8 +51,7 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
     ValueError
         If it is not a run, or the measurement is not named or not there.
     """
-    content = read_run(run)
-    entries = _entries(content)
+    content, entries = _entries(run)
     points = [entry for entry in entries if entry.path.name.startswith("point-")]
     among = points if measurement_id is None and len(points) == 1 else entries
     try:
@@ -68,13 +70,14 @@ def run_entries(run: Path) -> list[StoredEntry]:
     ValueError
         If it is no run.
     """
-    return _entries(read_run(run))
+    return _entries(run)[1]
 
 
-def _entries(run: RunContent) -> list[StoredEntry]:
-    return [
-        StoredEntry(key, path, _read, _place_of(path))
-        for path in run.paths()
+def _entries(run: Path) -> tuple[RunContent, list[StoredEntry]]:
+    content = read_run(run)
+    return content, [
+        StoredEntry(key, path, partial(_read, path, key), _place_of(path))
+        for path in content.paths()
         for key in _ids_of(path)
     ]
 
@@ -101,11 +104,11 @@ def measurement_at(run: Path, point: int) -> int:
     return measured[point]
 
 
-def _read(entry: StoredEntry) -> StoredMeasurement:
-    for measurement in measurements_of_file(entry.path):
-        if measurement.measurement_id == entry.measurement_id:
+def _read(path: Path, measurement_id: int) -> StoredMeasurement:
+    for measurement in measurements_of_file(path):
+        if measurement.measurement_id == measurement_id:
             return measurement
-    raise ValueError(f"no record of measurement {entry.measurement_id} in {entry.path.name}")
+    raise ValueError(f"no record of measurement {measurement_id} in {path.name}")
 
 
 def recording_of_point(run: Path, result: PointResult) -> Recording:
@@ -118,7 +121,7 @@ def recording_of_point(run: Path, result: PointResult) -> Recording:
     """
     if not result.measurement_id:
         raise ValueError(f"{result.outcome.name.lower()}, nothing was measured")
-    return recording_of(_read(StoredEntry(result.measurement_id, file_of(run, result), _read)))
+    return recording_of(_read(file_of(run, result), result.measurement_id))
 
 
 def recorded_results(run: RunContent) -> Iterator[bytes]:
@@ -132,12 +135,20 @@ def recorded_results(run: RunContent) -> Iterator[bytes]:
         if entry is not None and entry.result is not None:
             yield entry.message
             continue
-        for _, _, message in read_messages_of_type(path, TYPE):
-            poles = None
-            for _, topic, poles_message in read_messages_of_type(path, POLES_TYPE):
-                if topic.rsplit("/", 1)[-1] == "poles":
-                    poles = poles_message
-            yield serialised(from_message(message), poles)
+        for _, _, message in read_messages(path, TYPE):
+            yield serialised(from_message(message), last_poles(path))
+
+
+def last_poles(path: Path) -> Any:
+    """The last message of poles of a file, of which truths of a simulation are none; None: it has none.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
+    """
+    messages = (each for _, topic, each in read_messages(path, POLES_TYPE) if is_poles(topic))
+    return next(iter(deque(messages, maxlen=1)), None)
 
 
 def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
@@ -151,10 +162,10 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
     excitations: defaultdict[int, list[Excitation]] = defaultdict(list)
     records: defaultdict[int, list[Record]] = defaultdict(list)
     problems: defaultdict[int, list[str]] = defaultdict(list)
-    for _, _, message in read_messages_of_type(path, EXCITATION):
+    for _, _, message in read_messages(path, EXCITATION):
         excitation = excitation_from_message(message)
         excitations[excitation.measurement_id].append(excitation)
-    for _, _, message in read_messages_of_type(path, RECORD):
+    for _, _, message in read_messages(path, RECORD):
         try:
             records[message.measurement_id].append(record_from_message(message))
         except ValueError as error:
@@ -165,5 +176,5 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
 
 def _ids_of(path: Path) -> list[int]:
     """Measurements of a file, by its excitations."""
-    messages = read_messages_of_type(path, EXCITATION)
+    messages = read_messages(path, EXCITATION)
     return list(dict.fromkeys(int(excitation.measurement_id) for _, _, excitation in messages))

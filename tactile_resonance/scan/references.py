@@ -13,8 +13,8 @@ from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.validity import Validity, check_in_air
 from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.scan.point_file import read_messages_of_type
 from tactile_resonance.scan.point_result import POLES_TYPE
+from tactile_resonance.scan.recorded import last_poles
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import DriftLimits
 
@@ -109,9 +109,8 @@ def read_reference(run: RunContent, name: str) -> MainMode | None:
 def _poles_of(run: RunContent, name: str) -> Poles | None:
     found = None
     for path in run.paths(POLES_TYPE, reference=name):
-        for _, topic, message in read_messages_of_type(path, POLES_TYPE):
-            if topic.rsplit("/", 1)[-1] == "poles":  # no truths
-                found, _ = poles_from_message(message)
+        if (message := last_poles(path)) is not None:
+            found, _ = poles_from_message(message)
     return found
 
 

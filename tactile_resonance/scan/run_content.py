@@ -35,7 +35,7 @@ from tactile_resonance.scan.point_file import (
     read_messages,
     topic_content,
 )
-from tactile_resonance.scan.point_result import TOPIC, TYPE, PointResult, from_message
+from tactile_resonance.scan.point_result import TYPE, PointResult, from_message
 from tactile_resonance.scan.points import ScanPoint
 
 FORMAT = "tactile_resonance run 1"
@@ -193,7 +193,7 @@ def _finished(
         if match is None:
             return content, None, checked
         if result is None:
-            found = [from_message(message) for _, _, message in read_messages(path, f"/{TOPIC}")]
+            found = [from_message(message) for _, _, message in read_messages(path, TYPE)]
             if len(found) != 1:
                 raise ValueError(f"{path.name}: {len(found)} results, expected one")
             result = found[0]

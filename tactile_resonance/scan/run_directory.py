@@ -51,6 +51,7 @@ from tactile_resonance.scan.point_result import (
     TYPE,
     PointResult,
     ResultsFile,
+    is_poles,
     serialised,
 )
 from tactile_resonance.scan.points import ScanPoint
@@ -335,7 +336,7 @@ class PointRecording:
     ) -> None:
         """Append one message; see `PointFileWriter.write`."""
         self._writer.write(topic, type_name, time_ns, cdr, qos)
-        if type_name == POLES_TYPE and topic.rsplit("/", 1)[-1] == "poles":  # no truths
+        if type_name == POLES_TYPE and is_poles(topic):
             self._poles = cdr
 
     def message_of(self, result: PointResult) -> bytes:

@@ -17,7 +17,7 @@ from tactile_resonance.fields import known, require
 from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.mechanics.indentation import IndentationRecord, Protocol
 from tactile_resonance.recording.messages import indentation_from_message
-from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.run_content import RunContent, file_of
 
@@ -178,7 +178,7 @@ def fits_at(run: RunContent, result: PointResult, **options: Any) -> tuple[Tissu
     ValueError
         If its file is damaged.
     """
-    messages = read_messages_of_type(file_of(run.path, result), TYPE)
+    messages = read_messages(file_of(run.path, result), TYPE)
     records = [indentation_from_message(message, result.label) for _, _, message in messages]
     return tuple(fitted(record, result, **options) for record in records)
 

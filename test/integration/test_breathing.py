@@ -15,6 +15,7 @@ from benchmarks.load_case import Load, demonstrate
 from tactile_resonance.report.point_details import deviations, truths_of
 from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import PointOutcome
+from tactile_resonance.scan.recorded import RECORD
 from tactile_resonance.scan.run_content import read_run
 
 HOST = own_host(19)
@@ -49,7 +50,7 @@ class Breathed:
     def records(self, index):
         """Those of a point, whether they count or not."""
         path = next((self.run.path / "recording").glob(f"point-{index:05}-*.mcap"))
-        return [message for _, _, message in read_messages(path, "/record")]
+        return [message for _, _, message in read_messages(path, RECORD)]
 
 
 def breathe(folder, motion, blocks, more=""):

@@ -20,7 +20,7 @@ from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.scan.point_file import read_messages_of_type
+from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import POLES_TYPE, PointResult
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_content import file_of
@@ -82,7 +82,7 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
                 assert spin_until(executor, lambda: recorder._counts["bench/truth"] >= TRUTHS)
             recording.finish(PointResult(0, measurement_id=KEY))
         (result,) = run.content.latest
-        messages = read_messages_of_type(file_of(run.path, result), POLES_TYPE)
+        messages = read_messages(file_of(run.path, result), POLES_TYPE)
         told = [poles_from_message(message)[1] for _, _, message in messages]
     assert [origin.time_ns for origin in told] == [1000 + k for k in range(TRUTHS)]
 

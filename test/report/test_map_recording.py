@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.report import map_recording
 from tactile_resonance.report.map_recording import write_map_recording
-from tactile_resonance.scan.map_messages import POINT
+from tactile_resonance.scan.map_messages import CLOUD, MARKERS, POINT
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_file import read_content, read_messages
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
@@ -77,7 +77,8 @@ def folder(tmp_path):
 
 
 def told(path, topic):
-    return [(time_ns, message) for time_ns, _, message in read_messages(path, topic)]
+    types = CLOUD, MARKERS, "tf2_msgs/msg/TFMessage"
+    return [(at_ns, message) for at_ns, of, message in read_messages(path, *types) if of == topic]
 
 
 def test_the_map_grows_with_the_tissue_that_counts(folder):

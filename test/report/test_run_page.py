@@ -219,7 +219,7 @@ def test_a_file_of_a_version_that_cannot_be_read_costs_its_details_alone(hostile
     def refuse(*_):
         raise ValueError("point-00000-00.mcap: recorded by a version without the field instant_s")
 
-    monkeypatch.setattr(point_details, "read_messages_of_type", refuse)
+    monkeypatch.setattr(point_details, "read_messages", refuse)
     details = point_details.details_of(run)
     told = warnings_of(run, None, details)
     problem = "cannot be read: point-00000-00.mcap: recorded"

@@ -41,7 +41,7 @@ def test_a_measurement_that_the_force_disturbs_is_begun_again_in_the_same_contac
     )
     # nothing is lost
     (path,) = (run.path / "recording").glob("point-00000-*.mcap")
-    assert len(list(read_messages(path, "/note"))) == 3
+    assert len(list(read_messages(path, "std_msgs/msg/String"))) == 3
 
 
 def test_a_force_that_is_never_quiet_fails_the_point_with_the_figures(tmp_path):

@@ -22,7 +22,7 @@ from tactile_resonance.report.run_tables import point_table
 from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import read_messages
-from tactile_resonance.scan.point_result import PointOutcome
+from tactile_resonance.scan.point_result import TYPE, PointOutcome
 from tactile_resonance.scan.progress import Controls, Request
 from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_content import read_run
@@ -155,7 +155,7 @@ def test_tissues_are_told_apart_at_the_nominal_force(tmp_path):
     _, run, _ = scan(tmp_path / "nominal", pressed_scene(), Bench(force_n=0.01))
     assert [r.tissue_class for r in run.latest] == ["unknown", "unknown"]
     (air,) = [f for f in run.files if f.name.endswith("-air-before.mcap")]
-    ((_, _, reference),) = read_messages(run.path / "recording" / air.name, "/point_result")
+    ((_, _, reference),) = read_messages(run.path / "recording" / air.name, TYPE)
     assert np.isnan(reference.nominal_f0_hz)
     assert reference.tissue_class == ""
 
