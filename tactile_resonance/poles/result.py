@@ -310,3 +310,16 @@ def natural_frequency_and_damping_jacobian(pole: ComplexArray) -> FloatArray:
         out[..., 1, 0] = -(im**2) / mag**3
         out[..., 1, 1] = re * im / mag**3
     return out
+
+
+def ellipse(covariance: FloatArray, points: int, probability: float) -> FloatArray:
+    """(..., 2, points) about 0, that holds a Gaussian error of covariance (..., 2, 2) with a probability."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0, 2 * np.pi, points)
+    circle = ellipse_radius(probability) * np.stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(vectors @ (np.sqrt(np.maximum(values, 0))[..., None] * circle))
+
+
+def ellipse_radius(probability: float) -> float:
+    """Of such an ellipse, in standard deviations."""
+    return float(np.sqrt(-2 * np.log1p(-probability)))  # chi-square, two degrees of freedom

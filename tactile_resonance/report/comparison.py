@@ -14,6 +14,7 @@ from scipy import stats
 from scipy.spatial import cKDTree
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.fields import counted
 from tactile_resonance.report import run_tables as tables
 from tactile_resonance.report.boundary import RunBoundary
 from tactile_resonance.report.page import HIGH, LOW, MM, listed, page, page_data
@@ -156,16 +157,12 @@ def sentence(name: str, first: str, found: Sequence[Difference], apart: Sequence
     )
     beside = f" Beside what was touched they differ by {'; '.join(apart)}." if apart else ""
     return (
-        f"{name} less {first}, {_places(len(found))} in common, poles {which}: differences of f0 have an rms "
-        f"of {rms[0]:.2f} of their standard deviations, at most {largest[0]:.1f}, those of the damping ratio "
-        f"{rms[1]:.2f}, at most {largest[1]:.1f}; {_places(beyond)} {differ} by more than "
+        f"{name} less {first}, {counted(len(found), 'place')} in common, poles {which}: differences of f0 have "
+        f"an rms of {rms[0]:.2f} of their standard deviations, at most {largest[0]:.1f}, those of the damping "
+        f"ratio {rms[1]:.2f}, at most {largest[1]:.1f}; {counted(beyond, 'place')} {differ} by more than "
         f"{SIGNIFICANT:g}. Were "
         f"nothing different, chance would give as much or more with probability {chance:.2g}.{beside}"
     )
-
-
-def _places(count: int) -> str:
-    return "1 place" if count == 1 else f"{count} places"
 
 
 def as_comparison(

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.files import write_whole
+from tactile_resonance.poles.result import ellipse
 
 SIMULATED = "simulated, not measured"
 PROBABILITY = 0.95
@@ -53,13 +54,4 @@ def draw_ellipse(
     **style: Any,
 ) -> None:
     """The ellipse of a covariance (2, 2) about a centre (2,)."""
-    axes.plot(*(np.asarray(centre)[:, None] + ellipse(covariance, 100)), **style)
-
-
-def ellipse(covariance: FloatArray, points: int) -> FloatArray:
-    """(2, points) about 0: holds an error with `PROBABILITY` if it is Gaussian, of this covariance (2, 2)."""
-    radius = np.sqrt(-2 * np.log1p(-PROBABILITY))  # chi-square with two degrees of freedom
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0, 2 * np.pi, points)
-    circle = radius * np.stack([np.cos(angle), np.sin(angle)])
-    return np.asarray(vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * circle))
+    axes.plot(*(np.asarray(centre)[:, None] + ellipse(covariance, 100, PROBABILITY)), **style)

@@ -11,8 +11,9 @@ from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
+from tactile_resonance.poles.result import ellipse
 from tactile_resonance.report.boundary import RunBoundary
-from tactile_resonance.report.drawing import PROBABILITY, SIMULATED, ellipse, new_figure
+from tactile_resonance.report.drawing import PROBABILITY, SIMULATED, new_figure
 from tactile_resonance.scan.level_set import PROBABILITY as LINE_PROBABILITY
 from tactile_resonance.scan.level_set import Lines
 from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, MapSurface, PoleMap
@@ -129,7 +130,7 @@ def _draw_plane(axes: Axes, pole_map: PoleMap) -> None:
         x = np.array([p.estimate for p in points])
         axes.plot(*x.T, _MARKS[k % len(_MARKS)], color=f"C{k}", ms=4, label=name or "poles")
         loops = [
-            (p.estimate[:, None] + ellipse(p.covariance, 100)).T
+            (p.estimate[:, None] + ellipse(p.covariance, 100, PROBABILITY)).T
             for p in points
             if np.all(np.isfinite(p.covariance))
         ]

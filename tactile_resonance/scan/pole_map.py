@@ -17,13 +17,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.poles.result import ellipse, ellipse_radius
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.adaptive import known_points
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, TiledSurface, krige_many
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
-from tactile_resonance.tissue.classify import UNKNOWN
 from tactile_resonance.scan.points import on_a_line
+from tactile_resonance.tissue.classify import UNKNOWN
 
 LOW_RGB = (64, 105, 255)
 HIGH_RGB = (255, 210, 50)
@@ -172,7 +173,7 @@ class PoleMap:
         stds = np.array([p.result.std for p in self.with_ellipse])
         if not len(stds):
             return EllipseScale(self.spacing_m, self.spacing_m)
-        largest = _radius(probability) * np.quantile(stds, 0.9, axis=0)
+        largest = ellipse_radius(probability) * np.quantile(stds, 0.9, axis=0)
         wanted = 0.4 * self.spacing_m / np.maximum(largest, 1e-12)
         return EllipseScale(_round_down(wanted[0]), _round_down(wanted[1]))
 
@@ -187,14 +188,9 @@ class PoleMap:
         """
         points = self.with_ellipse
         segments = int(np.clip(_MOST_SEGMENTS // max(len(points), 1), _LEAST_SEGMENTS, _SEGMENTS))
-        angle = np.linspace(0, 2 * np.pi, segments + 1)
-        circle = _radius(probability) * np.stack(
-            [np.cos(angle), np.sin(angle)]
-        )  # (2, segments + 1)
         stretch = np.array([scale.m_per_hz, scale.m_per_damping])
         covariances = np.array([p.result.covariance for p in points]).reshape(-1, 2, 2)
-        values, vectors = np.linalg.eigh(covariances * np.outer(stretch, stretch))
-        flat = vectors @ (np.sqrt(np.maximum(values, 0))[..., None] * circle)
+        flat = ellipse(covariances * np.outer(stretch, stretch), segments + 1, probability)
         axes = tangent_axes(np.array([p.normal for p in points]).reshape(-1, 3))
         centres = np.array([p.position_m for p in points]).reshape(-1, 1, 3)
         loops = centres + flat.swapaxes(-1, -2) @ axes  # (e, segments + 1, 3)
@@ -330,11 +326,6 @@ def tangent_axes(normal: FloatArray) -> FloatArray:
     first = start - np.sum(start * normal, axis=-1, keepdims=True) * normal
     first = first / np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(normal, first)], axis=-2)
-
-
-def _radius(probability: float) -> float:
-    """Of the ellipse that holds the truth with this probability, in standard deviations."""
-    return float(np.sqrt(-2 * np.log1p(-probability)))  # chi-square, two degrees of freedom
 
 
 def _round_down(value: float) -> float:
