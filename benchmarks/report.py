@@ -28,7 +28,7 @@ import numpy as np
 from benchmarks.processor import cpu_s, loop_s
 from tactile_resonance.commands.options import require_packages
 from tactile_resonance.processes import free_domain_id
-from tactile_resonance.report.point_details import detailed, details_of, truths_with
+from tactile_resonance.report.point_details import detailed, details_of, truths_of
 from tactile_resonance.report.run_report import as_page, pole_maps_of
 from tactile_resonance.scan.point_result import PointKind
 from tactile_resonance.scan.run_content import RunContent, read_run
@@ -71,7 +71,7 @@ def _written(
     begun_s = time.process_time()
     details = details_of(details_from or content)
     if details_from is None:
-        truths = truths_with(content, details)
+        truths = truths_of(content, details)
     else:
         each = list(details.values())
         chosen = detailed(content.latest)

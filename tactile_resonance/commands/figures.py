@@ -7,7 +7,6 @@ import argparse
 import sys
 from pathlib import Path
 
-NAMES = ("simulation", "distortion", "variance", "mechanics")
 BAND_HZ = (200.0, 300.0)  # around the mode that is fitted
 # of mechanical tests: what relaxes by four fifths is still more than the limit of a lost contact
 FORCE_N = 0.018
@@ -23,7 +22,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "(figure 7), creep and unloading with their fits, from the simulated bench. Nothing here is a "
         "measurement.",
     )
-    parser.add_argument("name", nargs="?", choices=NAMES, help="default: all")
+    parser.add_argument("name", nargs="?", choices=tuple(DRAW), help="default: all")
     parser.add_argument(
         "--output",
         type=Path,
@@ -37,14 +36,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Simulate, analyse, draw."""
     options.output.mkdir(parents=True, exist_ok=True)
-    draw = {
-        "simulation": _simulation,
-        "distortion": _distortion,
-        "variance": _variance,
-        "mechanics": _mechanics,
-    }
-    for name in NAMES if options.name is None else (options.name,):
-        draw[name](options.output)
+    for name in DRAW if options.name is None else (options.name,):
+        DRAW[name](options.output)
     return 0
 
 
@@ -158,3 +151,11 @@ def _mechanics(output: Path) -> None:
         title = f"{protocol.value.capitalize()} of tissue under a rigid ball of 5 mm"
         save_figure(draw_tests(tests, title), output / f"test_{protocol.value}.png")
     print(f"figures in {output}: test_relaxation.png, test_creep.png, test_indentation.png")
+
+
+DRAW = {
+    "simulation": _simulation,
+    "distortion": _distortion,
+    "variance": _variance,
+    "mechanics": _mechanics,
+}

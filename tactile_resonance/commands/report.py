@@ -76,7 +76,7 @@ def report_run(folder: Path) -> int:
     from tactile_resonance.report.boundary import FILE, boundary_of_run
     from tactile_resonance.report.drawing import figure_bytes
     from tactile_resonance.report.map_recording import write_map_recording
-    from tactile_resonance.report.point_details import details_of, truths_with
+    from tactile_resonance.report.point_details import details_of, truths_of
     from tactile_resonance.report.pole_map_figure import draw_pole_map
     from tactile_resonance.report.run_report import (
         as_page,
@@ -90,7 +90,7 @@ def report_run(folder: Path) -> int:
     from tactile_resonance.scan.run_content import not_checked
 
     details, boundary = details_of(content), boundary_of_run(content)
-    truths = truths_with(content, details)
+    truths = truths_of(content, details)
     pole_maps, pictures = pole_maps_of(content), []
     name = folder.resolve().name
     for band, pole_map in enumerate(pole_maps):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -102,13 +102,10 @@ def boundary_of_run(run: RunContent) -> RunBoundary | None:
     truth = true_f0_hz(phantoms, asked, boundary.level_set.levels[0])
     surface = asked.krige(known_points(run.latest))
     assert surface is not None  # else there were no boundary
-    return RunBoundary(
-        boundary,
-        found.wanted_m2,
-        found.touches,
-        frame_id,
-        asked.raster.lines(boundary.level_set.depth(truth)),
-        difference_m2(surface, boundary.level_set, asked.raster, truth),
+    return replace(
+        found,
+        true_outline_m=asked.raster.lines(boundary.level_set.depth(truth)),
+        off_m2=difference_m2(surface, boundary.level_set, asked.raster, truth),
     )
 
 

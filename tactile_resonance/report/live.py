@@ -129,8 +129,7 @@ class LiveRun:
                     {
                         "name": f"band {k + 1}",
                         "points": [point_entry(r.of_band(k)) for r in results],
-                        "boundary": None,
-                        "surface": self._surface(k)["surface"],
+                        **self._surface(k),
                     }
                     for k in range(len(self._maps))
                 ],
@@ -151,7 +150,10 @@ class LiveRun:
             self._results[result.index], self._newest = result, result.index
             bands = max(1 + len(result.further), len(self._maps))
             wider = bands > len(self._maps)
-            self._maps += [self._map_of(k) for k in range(len(self._maps), bands)]
+            self._maps += [
+                GrowingMap(r.of_band(k) for r in self._results.values())
+                for k in range(len(self._maps), bands)
+            ]
             for k, grown in enumerate(self._maps):
                 grown.take(result.of_band(k))
             self._map_is_old = True
@@ -170,9 +172,6 @@ class LiveRun:
             points = [point_entry(result.of_band(k)) for k in range(len(self._maps))]
             details = {str(k): each for k, each in self._details.items() if k == result.index}
             self._publish("point", {"bands": points, "details": details})
-
-    def _map_of(self, band: int) -> GrowingMap:
-        return GrowingMap(result.of_band(band) for result in self._results.values())
 
     def take_frf(self, message: Any) -> None:
         """FRF of the measurement under way, the latest counts; of ROS or of rosbags."""
@@ -226,14 +225,14 @@ class LiveRun:
                 self._map_is_old = False
                 begun_s = self._clock_s()
                 for band in range(len(self._maps)):
-                    self._publish("surface", self._surface(band))
+                    self._publish("surface", {"band": band, **self._surface(band)})
                 ended_s = self._clock_s()
                 self._map_from_s = ended_s + (ended_s - begun_s) / _BUSY_SHARE
 
     def _surface(self, band: int) -> dict[str, Any]:
         pole_map = self._maps[band].map
         surface = pole_map.surface(_CELLS) if len(pole_map.points) <= MOST_OF_A_MAP else None
-        return {"band": band, "surface": map_entry(surface, None)["surface"]}
+        return map_entry(surface, None)
 
     def _text(self) -> str:
         """What goes on, for people."""

@@ -259,14 +259,14 @@ def shown_lines(
     for low, high in bands_hz:
         inside |= (frequency_hz >= low) & (frequency_hz <= high)
     within, beside = np.flatnonzero(inside), np.flatnonzero(~inside)
-    within = _evenly(within, most)
-    return np.sort(np.concatenate([within, _evenly(beside, most - within.size)]))
+    within = within[evenly(within.size, most)]
+    beside = beside[evenly(beside.size, most - within.size)]
+    return np.sort(np.concatenate([within, beside]))
 
 
-def _evenly(indices: IntArray, most: int) -> IntArray:
-    if indices.size <= most:
-        return indices
-    return indices[np.unique(np.linspace(0, indices.size - 1, max(most, 0)).round().astype(int))]
+def evenly(count: int, most: int) -> IntArray:
+    """Indices of so many of `count`, evenly over all."""
+    return np.unique(np.linspace(0, count - 1, min(count, max(most, 0))).round().astype(int))
 
 
 def _model_entry(
@@ -344,7 +344,7 @@ def mechanics_entry(one: TissueTest) -> dict[str, Any]:
     entry, fit = one.as_json(), one.fit
     if fit is None:
         return {**entry, "curve": None}
-    kept = _evenly(np.arange(fit.time_s.size), _MOST_MEANS)
+    kept = evenly(fit.time_s.size, _MOST_MEANS)
     curve = {
         "t_s": listed(fit.time_s[kept]),
         "measured_mn": listed(MN * fit.measured_n[kept]),

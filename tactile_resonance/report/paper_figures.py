@@ -84,9 +84,8 @@ def _trace(
 ) -> Trace:
     """Dots; names come from the scene, and plotly reads tags."""
     x, y = np.asarray(x, float), np.asarray(y, float)
-    if x.size > _MOST_LINES:
-        shown = np.unique(np.linspace(0, x.size - 1, _MOST_LINES).round().astype(int))
-        x, y = x[shown], y[shown]
+    shown = evenly(x.size, _MOST_LINES)
+    x, y = x[shown], y[shown]
     trace = {"type": "scatter", "mode": "markers", "name": html.escape(name, quote=False)}
     marker = {"color": colour, "size": 4, "symbol": symbol}
     return {**trace, "marker": marker, "x": listed(x, 8), "y": listed(y), **more}

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.report.page import (
     MN,
+    evenly,
     frf_entry,
     listed,
     mechanics_entry,
@@ -86,14 +88,8 @@ class PointDetails:
 
 def detailed(results: Sequence[PointResult], most: int = MOST_DETAILED) -> list[PointResult]:
     """Points that were measured, at most so many of them, spread evenly over the run."""
-    done = (r for r in results if r.outcome is PointOutcome.DONE and r.measurement_id)
-    return _spread(list(done), most)
-
-
-def _spread(results: Sequence[PointResult], most: int) -> list[PointResult]:
-    if len(results) <= most:
-        return list(results)
-    return [results[k] for k in np.linspace(0, len(results) - 1, most).round().astype(int)]
+    done = [r for r in results if r.outcome is PointOutcome.DONE and r.measurement_id]
+    return [done[k] for k in evenly(len(done), most)]
 
 
 def lines_each(points: int) -> int:
@@ -104,8 +100,8 @@ def lines_each(points: int) -> int:
 def details_of(run: RunContent, most: int = MOST_DETAILED) -> dict[int, PointDetails]:
     """By point, of those that are `detailed` or tested; a file that cannot be read has its problem instead."""
     counts, found = run.messages_at(TEST_TYPE), {}
-    tested = _spread([r for r in run.latest if r.index in counts], min(most, MOST_TESTED))
-    with_tests = {result.index for result in tested}
+    tested = [r.index for r in run.latest if r.index in counts]
+    with_tests = {tested[k] for k in evenly(len(tested), min(most, MOST_TESTED))}
     wanted = with_tests.union(result.index for result in detailed(run.latest, most))
     for result in (r for r in run.latest if r.index in wanted):
         try:
@@ -118,12 +114,6 @@ def details_of(run: RunContent, most: int = MOST_DETAILED) -> dict[int, PointDet
                 found.get(result.index, PointDetails()), problem=str(error)
             )
     return found
-
-
-def truths_with(run: RunContent, details: Mapping[int, PointDetails]) -> dict[int, PointTruth]:
-    """Truth of all points of a simulated run: out of their details, and of the others out of the recording."""
-    known = {index: each.truth for index, each in details.items() if each.truth is not None}
-    return {**known, **truths_of(run, details)}
 
 
 def read_details(run: RunContent, result: PointResult) -> PointDetails:
@@ -176,24 +166,27 @@ class PointTruth:
     force_rms_n: float
 
 
-def truths_of(run: RunContent, known: Container[int] = ()) -> dict[int, PointTruth]:
+def truths_of(
+    run: RunContent, details: Mapping[int, PointDetails] = MappingProxyType({})
+) -> dict[int, PointTruth]:
     """Truth of the latest attempts, by point; empty for a run on hardware.
 
     Parameters
     ----------
     run : RunContent
-    known : container of int
-        Points that are left out.
+    details : mapping of int to PointDetails
+        Of points whose files were read: theirs is taken from there.
 
     Raises
     ------
     ValueError
         If a file is damaged.
     """
-    truths, told_at = {}, run.messages_at(POLES_TYPE)
+    truths = {index: each.truth for index, each in details.items() if each.truth is not None}
+    told_at = run.messages_at(POLES_TYPE)
     for result in run.latest:
         done = result.simulated and result.outcome is PointOutcome.DONE
-        if not done or result.index in known or result.index not in told_at:
+        if not done or result.index in details or result.index not in told_at:
             continue
         messages = read_messages(file_of(run.path, result), POLES_TYPE)
         told = [poles_from_message(message) for _, _, message in messages]
