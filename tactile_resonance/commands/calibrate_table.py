@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_resonance.commands.bench_scan import (
+    START_WITHIN_S,
     Job,
     add_robot_host,
     node_parameters,
@@ -32,7 +33,6 @@ TRUTH = (3e-3, 0.0123, -0.0123)
 """Of the simulated table against where scan_node expects it: height [m], tilts about x and y [rad]; 1 deg."""
 SIMULATED_POINTS = "[[-0.015, -0.015], [0.015, -0.015], [0.015, 0.015], [-0.015, 0.015], [0, 0]]"
 SIMULATED_SEARCH_M = 5e-3
-START_WITHIN_S = 300.0
 WITHIN_S = 3600.0
 NODE_WITHIN_S = 10.0
 

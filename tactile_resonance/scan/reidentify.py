@@ -26,7 +26,7 @@ from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.fields import read_dataclass, read_yaml, section
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.joint_records import identify_poles_from_bins
-from tactile_resonance.poles.result import STATUSES, Poles, PolesBatch, PolesStatus
+from tactile_resonance.poles.result import STATUSES, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.kept_bins import (
     PLACE,
@@ -208,15 +208,21 @@ def _identified(job: tuple) -> tuple[npt.NDArray, str]:
     u, y = (points[name][..., here].astype(complex) for name in ("u", "y"))  # (n, M, K)
     batch = plan.from_bins(u[:, 0], y[:, 0]) if kind.realisations == 1 else plan.from_bins(u, y)
     rows = np.zeros(points.size, dtype)
-    _fill_nan(rows)
     rows["run"] = run
     for name in PLACE:
         rows[name] = points[name]
-    _fill(rows, batch)
+    total = batch.total_covariance
+    known = np.isfinite(total).all(axis=(2, 3), keepdims=True)
+    there = np.isfinite(batch.poles_rad_s) & batch.significant
+    _fill(rows, batch, there, np.where(known, total, batch.covariance))
+    rows[STATUS] = batch.status_code
     for k in np.flatnonzero(_unsure(batch, kind)):
-        _fill_one(
-            rows[k : k + 1], identify_poles_from_bins(kind.bins(points[k]), band_hz, structure)
-        )
+        poles = identify_poles_from_bins(kind.bins(points[k]), band_hz, structure)
+        names = ("poles_rad_s", "residues", "f0_hz", "damping_ratio", *_COSTS)
+        alone = SimpleNamespace(**{name: np.asarray(getattr(poles, name))[None] for name in names})
+        there = np.ones((1, poles.f0_hz.size), bool)
+        _fill(rows[k : k + 1], alone, there, poles.best_covariance[None])
+        rows[STATUS][k] = STATUSES.index(poles.status)
     return rows, _as_csv(rows, name_of_run)
 
 
@@ -228,31 +234,6 @@ def _unsure(batch: PolesBatch, kind: BinsKind) -> BoolArray:
     return ~sure
 
 
-def _fill(rows: npt.NDArray, batch: PolesBatch) -> None:
-    total = batch.total_covariance
-    known = np.isfinite(total).all(axis=(2, 3), keepdims=True)
-    there = np.isfinite(batch.poles_rad_s) & batch.significant
-    _fill_modes(rows, batch, there, np.where(known, total, batch.covariance))
-    rows[STATUS] = batch.status_code
-
-
-def _fill_one(row: npt.NDArray, poles: Poles) -> None:
-    _fill_nan(row, tuple(PLACE))
-    alone = {
-        name: np.asarray(getattr(poles, name))[None]
-        for name in (*("poles_rad_s", "residues", "f0_hz", "damping_ratio"), *_COSTS)
-    }
-    there = np.ones((1, poles.f0_hz.size), bool)
-    _fill_modes(row, SimpleNamespace(**alone), there, poles.best_covariance[None])
-    row[STATUS] = STATUSES.index(poles.status)
-
-
-def _fill_nan(rows: npt.NDArray, but: tuple[str, ...] = ()) -> None:
-    for name in set(rows.dtype.names or ()) - set(but):
-        if rows.dtype[name].kind == "f":
-            rows[name] = np.nan
-
-
 def _main_first(peak: FloatArray) -> IntArray:
     """(n, places) order of modes: the highest peak, then the others as they are, those without one last."""
     places = np.tile(np.arange(peak.shape[1]), (len(peak), 1))
@@ -262,7 +243,7 @@ def _main_first(peak: FloatArray) -> IntArray:
     return np.argsort(np.where(np.isneginf(peak), peak.shape[1] + places, rank), axis=1)
 
 
-def _fill_modes(
+def _fill(
     rows: npt.NDArray,
     found: PolesBatch | SimpleNamespace,
     there: BoolArray,
@@ -284,6 +265,9 @@ def _fill_modes(
         *(taken(found.f0_hz), std[..., 0], taken(found.damping_ratio), std[..., 1]),
         *(covariance[..., 0, 1], poles_rad_s.real, poles_rad_s.imag),
     )
+    for name in rows.dtype.names or ():
+        if name.startswith(_MODE):
+            rows[name] = np.nan
     for name, values in zip(_MODE, columns, strict=True):
         for place in range(values.shape[1]):
             rows[name if place == 0 else f"{name}_{place + 1}"] = values[:, place]
