@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ BESIDE_S = 30.0
 MECHANICS = "mechanics.csv"
 AT_S = (0.5, 1.0, 10.0, 60.0)
 """Times after a step at which moduli are listed [s]."""
+_OF_COURSE = ("ramp_s", "hold_s", "peak_force_n", "relaxed_share")  # fields of a fit
 
 
 @dataclass(frozen=True)
@@ -124,34 +125,18 @@ class TissueTest:
         }
         if fit is None:
             return found
+        plain = ("surface_m", "surface_std_m", "chi_square", "dof", "bic", "contact_ratio")
         return {
             **found,
-            "ramp_s": fit.ramp_s,
-            "hold_s": fit.hold_s,
-            "peak_force_n": fit.peak_force_n,
-            "relaxed_share": fit.relaxed_share,
+            **{name: getattr(fit, name) for name in _OF_COURSE},
             "modulus_pa": {f"{at:g}": [known(value) for value in fit.modulus(at)] for at in AT_S},
             "equilibrium_pa": [
                 fit.equilibrium_pa,
                 fit.equilibrium_std,
                 fit.equilibrium_known.value,
             ],
-            "terms": [
-                {
-                    "modulus_pa": term.modulus_pa,
-                    "modulus_std": term.modulus_std,
-                    "time_s": term.time_s,
-                    "time_std": term.time_std,
-                    "known": term.known.value,
-                }
-                for term in fit.terms
-            ],
-            "surface_m": fit.surface_m,
-            "surface_std_m": fit.surface_std_m,
-            "chi_square": fit.chi_square,
-            "dof": fit.dof,
-            "bic": list(fit.bic),
-            "contact_ratio": fit.contact_ratio,
+            "terms": [{**asdict(term), "known": term.known.value} for term in fit.terms],
+            **{name: getattr(fit, name) for name in plain},
             "sphere_share": known(fit.sphere_share),
             "layer_share": known(fit.layer_share),
             "status": list(fit.status),
@@ -199,8 +184,7 @@ def write_fits(run: Path, tests: Sequence[TissueTest]) -> None:
 def as_csv(tests: Sequence[TissueTest]) -> str:
     """One row each, deviations relative; `known`: whether constants are determined; unknown numbers ``nan``."""
     most = max((len(one.fit.terms) for one in tests if one.fit is not None), default=0)
-    head = ["point", "label", "protocol", "simulated", "ramp_s", "hold_s", "peak_force_n"]
-    head += ["relaxed_share"]
+    head = ["point", "label", "protocol", "simulated", *_OF_COURSE]
     for at in AT_S:
         head += [f"modulus_{at:g}s_pa", f"modulus_{at:g}s_std"]
     head += ["equilibrium_pa", "equilibrium_std", "equilibrium_known"]
@@ -216,7 +200,7 @@ def _row(one: TissueTest, most: int) -> list[object]:
     row: list[object] = [point, test.label, test.protocol.value, test.simulated]
     if fit is None:
         return [*row, *[nan] * (7 + 2 * len(AT_S) + 5 * most), one.reason]
-    row += [fit.ramp_s, fit.hold_s, fit.peak_force_n, fit.relaxed_share]
+    row += [getattr(fit, name) for name in _OF_COURSE]
     for at in AT_S:
         row += fit.modulus(at)
     row += [fit.equilibrium_pa, fit.equilibrium_std, fit.equilibrium_known.value]
