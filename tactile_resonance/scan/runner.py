@@ -239,7 +239,7 @@ class ScanRunner:
             disturbed = self._disturbed.pop(point.index, Disturbances())
             result = replace(
                 result,
-                reason=_joined(result.reason, moved if moved_n else "", not_tested),
+                reason=_joined(result.reason, reason, moved if moved_n else "", not_tested),
                 repeats=disturbed.total,
                 disturbances=str(disturbed),
                 gate="" if measured is None else str(keeper),

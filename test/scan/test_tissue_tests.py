@@ -16,7 +16,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal
-from tactile_resonance.scan.hands import PointDisturbed, PointFailed
+from tactile_resonance.scan.hands import ATTEMPTS, PointDisturbed, PointFailed
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.plan_text import plan_rows
 from tactile_resonance.scan.point_result import PointOutcome
@@ -98,6 +98,17 @@ def test_a_test_that_is_disturbed_repeats_its_point(tmp_path):
     run = read_run(tmp_path / "run")
     assert run.latest[1].repeats == 1
     assert [len(fits_at(run, result)) for result in run.latest] == [0, 1]
+
+
+def test_a_test_that_stays_disturbed_leaves_the_poles_and_says_why(tmp_path):
+    def disturbed(point, asked):
+        raise PointDisturbed("contact: force_stale", "force_stale")
+
+    scan(tmp_path / "run", scene(2, protocols=(RELAXATION,)), Bench(tests=disturbed))
+    _, second = read_run(tmp_path / "run").latest
+    assert (second.outcome, second.repeats) == (PointOutcome.DONE, ATTEMPTS - 1)
+    assert second.f0_hz == pytest.approx(254, abs=0.1)
+    assert "contact: force_stale" in second.reason
 
 
 def test_the_plan_counts_tests(tmp_path):
