@@ -175,32 +175,6 @@ class Posture:
             c5 * across - s5 * (c234 * level + s234 * mz),
         )
 
-    def frames(self) -> tuple[Transform, ...]:
-        """Return base and links 1 to 6 in the base."""
-        s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = self._numbers
-        q2, q23 = self.q[1], self.q[1] + self.q[2]
-
-        def in_plane(cosine: float, sine: float, r: float, h: float) -> Transform:
-            turn = (cosine * c1, -sine * c1, s1, cosine * s1, -sine * s1, -c1, sine, cosine, 0.0)
-            return turn, (r * c1, r * s1, D1 + h)
-
-        x, y, z4 = c234 * c1, c234 * s1, (s234 * c1, s234 * s1, -c234)
-        fourth = (x, s1, z4[0], y, -c1, z4[1], s234, 0.0, z4[2])
-        fifth = (
-            c5 * x + s5 * s1, -z4[0], c5 * s1 - s5 * x,
-            c5 * y - s5 * c1, -z4[1], -c5 * c1 - s5 * y,
-            c5 * s234, -z4[2], -s5 * s234,
-        )  # fmt: skip
-        return (
-            IDENTITY,
-            in_plane(1.0, 0.0, 0.0, 0.0),
-            in_plane(math.cos(q2), math.sin(q2), r2, h2),
-            in_plane(math.cos(q23), math.sin(q23), r3, h3),
-            (fourth, (r3 * c1 + D4 * s1, r3 * s1 - D4 * c1, D1 + h3)),
-            (fifth, (r4 * c1 + D4 * s1, r4 * s1 - D4 * c1, D1 + h4)),
-            self.flange,
-        )
-
 
 @njit
 def _cosine(numerator, denominator):

@@ -2,26 +2,18 @@
 """RTDE outputs of the controller: names, types and how each follows from its state.
 
 Names and types: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". Not modelled, and nominal
-therefore: temperatures, voltages, execution time, analogue inputs; the accelerometer in the tool feels
-gravity alone. Currents are torques over an assumed constant, without friction or inertia. Masses and
-centres of mass of the links: Universal Robots, "Parameters for calculations of kinematics and dynamics"
-(article 45257), table UR5e.
+therefore: temperatures, voltages, execution time, analogue inputs; torques, currents and momentum of the arm,
+which are 0. The accelerometer in the tool feels gravity alone.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cached_property
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Vector, rotated_back
-from tactile_resonance.simulation.ur5e.forces import ToolPayload
-from tactile_resonance.simulation.ur5e.kinematics import Posture
-from tactile_resonance.simulation.ur5e.poses import Six, pose_from_transform, total
+from tactile_resonance.simulation.ur5e.poses import ZERO, pose_from_transform
 from tactile_resonance.simulation.ur5e.registers import REGISTER_COUNT
 from tactile_resonance.simulation.ur5e.safety import RobotMode
 
@@ -29,57 +21,8 @@ if TYPE_CHECKING:
     from tactile_resonance.simulation.ur5e.controller import UrController
 
 
-LINK_MASS_KG = np.array([3.761, 8.058, 2.846, 1.37, 1.3, 0.365])
-# In the frames of the links 1 to 6.
-LINK_CENTRE_M = np.array(
-    [
-        [0.0, -0.02561, 0.00193],
-        [0.2125, 0.0, 0.11336],
-        [0.15, 0.0, 0.0265],
-        [0.0, -0.0018, 0.01634],
-        [0.0, 0.0018, 0.01634],
-        [0.0, 0.0, -0.001159],
-    ]
-)
-
-
-def gravity_torque(posture: Posture, gravity_m_s2: Vector, payload: ToolPayload) -> Six:
-    """Return the torques [N m] that hold links and payload against gravity.
-
-    Parameters
-    ----------
-    posture : Posture
-    gravity_m_s2 : Vector
-        Acceleration of free fall in the base.
-    payload : ToolPayload
-    """
-    return tuple((_momentum_per_speed(posture, payload) @ np.negative(gravity_m_s2)).tolist())
-
-
-def momentum(posture: Posture, qd: Six, payload: ToolPayload) -> float:
-    """Return the norm of the linear momentum of links and payload [kg m/s]."""
-    return float(np.linalg.norm(np.array(qd) @ _momentum_per_speed(posture, payload)))
-
-
-def _momentum_per_speed(posture: Posture, payload: ToolPayload) -> FloatArray:
-    """Return the linear momentum that a unit speed of each joint carries, shape (6, 3)."""
-    frames = posture.frames()
-    turn = np.array([frame[0] for frame in frames]).reshape(7, 3, 3)
-    origin = np.array([frame[1] for frame in frames])
-    mass = np.append(LINK_MASS_KG, payload.mass_kg)
-    centre = np.concatenate([LINK_CENTRE_M, [payload.cog_m]])
-    carrier = [1, 2, 3, 4, 5, 6, 6]  # the payload sits on the last link
-    point = origin[carrier] + (turn[carrier] @ centre[..., None])[..., 0]  # (7, 3)
-    # first moment of all that a joint carries, about a point of its axis
-    carried = np.cumsum(mass[::-1])[::-1][:6]
-    moment = np.cumsum((mass[:, None] * point)[::-1], axis=0)[::-1][:6]
-    return np.cross(turn[:6, :, 2], moment - carried[:, None] * origin[:6])
-
-
 OutputValue = float | int | list[float] | list[int]
 
-# Joint torque per motor current [N m/A]; the maker publishes none.
-TORQUE_PER_CURRENT = 10.0
 # Of the joints (RTDE guide): running, or without power.
 JOINT_RUNNING, JOINT_POWER_OFF = 253, 239
 NOMINAL_TEMPERATURE_C = 28.0
@@ -87,7 +30,7 @@ MAINS_V, ROBOT_BUS_V = 230.0, 48.0
 
 
 class Outputs:
-    """Outputs of one cycle; what several of them share is computed once, when first asked for."""
+    """Outputs of one cycle."""
 
     def __init__(self, robot: UrController) -> None:
         self.robot = robot
@@ -98,19 +41,6 @@ class Outputs:
             raise KeyError(f"RTDE output {name!r}: not known")
         value = READERS[name](self)
         return list(value) if isinstance(value, tuple) else value
-
-    @cached_property
-    def target_moment(self) -> Six:
-        """Torques that hold the arm at its target."""
-        machine = self.robot.machine
-        return gravity_torque(machine.target.posture, machine.gravity_m_s2, machine.payload)
-
-    @cached_property
-    def actual_moment(self) -> Six:
-        """Torques that hold the arm against gravity and against what pushes the tool."""
-        machine = self.robot.machine
-        held = gravity_torque(machine.posture, machine.gravity_m_s2, machine.payload)
-        return total(held, machine.outer_torque)
 
     @property
     def tool_accelerometer(self) -> Vector:
@@ -131,11 +61,6 @@ class Outputs:
         return [JOINT_RUNNING if self.robot.safety.powered else JOINT_POWER_OFF] * 6
 
 
-def _currents(moment: Six) -> Six:
-    """Motor currents [A] of joint torques [N m]."""
-    return tuple([torque / TORQUE_PER_CURRENT for torque in moment])
-
-
 Reader = Callable[[Outputs], tuple[float, ...] | OutputValue]
 
 _OUTPUTS: dict[str, tuple[str, Reader]] = {
@@ -143,15 +68,15 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
     "target_q": ("VECTOR6D", lambda o: o.robot.machine.target.q),
     "target_qd": ("VECTOR6D", lambda o: o.robot.machine.target.qd),
     "target_qdd": ("VECTOR6D", lambda o: o.robot.machine.target.qdd),
-    "target_current": ("VECTOR6D", lambda o: _currents(o.target_moment)),
-    "target_moment": ("VECTOR6D", lambda o: o.target_moment),
+    "target_current": ("VECTOR6D", lambda o: ZERO),
+    "target_moment": ("VECTOR6D", lambda o: ZERO),
     "actual_q": ("VECTOR6D", lambda o: o.robot.machine.joints.q),
     "actual_qd": ("VECTOR6D", lambda o: o.robot.machine.joints.qd),
     "actual_qdd": ("VECTOR6D", lambda o: o.robot.machine.joints.qdd),
-    "actual_moment": ("VECTOR6D", lambda o: o.actual_moment),
-    "actual_current": ("VECTOR6D", lambda o: _currents(o.actual_moment)),
-    "actual_current_as_torque": ("VECTOR6D", lambda o: o.actual_moment),
-    "joint_control_output": ("VECTOR6D", lambda o: _currents(o.actual_moment)),
+    "actual_moment": ("VECTOR6D", lambda o: ZERO),
+    "actual_current": ("VECTOR6D", lambda o: ZERO),
+    "actual_current_as_torque": ("VECTOR6D", lambda o: ZERO),
+    "joint_control_output": ("VECTOR6D", lambda o: ZERO),
     "actual_TCP_pose": ("VECTOR6D", lambda o: o.robot.machine.tcp_pose),
     "actual_TCP_speed": ("VECTOR6D", lambda o: o.robot.machine.tcp_twist),
     "actual_TCP_force": ("VECTOR6D", lambda o: o.robot.machine.tcp_force),
@@ -170,18 +95,10 @@ _OUTPUTS: dict[str, tuple[str, Reader]] = {
         lambda o: o.robot.ports.speed_slider if o.robot.program else 0.0,
     ),
     "target_speed_fraction": ("DOUBLE", lambda o: o.robot.ports.speed_slider),
-    "actual_momentum": (
-        "DOUBLE",
-        lambda o: momentum(
-            o.robot.machine.posture, o.robot.machine.joints.qd, o.robot.machine.payload
-        ),
-    ),
+    "actual_momentum": ("DOUBLE", lambda o: 0.0),
     "actual_main_voltage": ("DOUBLE", lambda o: MAINS_V),
     "actual_robot_voltage": ("DOUBLE", lambda o: ROBOT_BUS_V if o.robot.safety.powered else 0.0),
-    "actual_robot_current": (
-        "DOUBLE",
-        lambda o: sum(map(abs, o.actual_moment)) / TORQUE_PER_CURRENT,
-    ),
+    "actual_robot_current": ("DOUBLE", lambda o: 0.0),
     "actual_joint_voltage": ("VECTOR6D", lambda o: [ROBOT_BUS_V * o.robot.safety.powered] * 6),
     "runtime_state": ("UINT32", lambda o: int(o.robot.runtime_state)),
     "standard_analog_input0": ("DOUBLE", lambda o: 0.0),

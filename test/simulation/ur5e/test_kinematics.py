@@ -10,14 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.ur5e import kinematics
-from tactile_resonance.simulation.ur5e.forces import ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
-from tactile_resonance.simulation.ur5e.outputs import (
-    LINK_CENTRE_M,
-    LINK_MASS_KG,
-    gravity_torque,
-    momentum,
-)
 from tactile_resonance.simulation.ur5e.poses import pose_from_transform, transform_from_pose
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -191,32 +184,3 @@ def test_poses_and_transforms_are_inverse_to_each_other(postures):
         flange = Posture(floats(q)).flange
         again = transform_from_pose(pose_from_transform(flange))
         np.testing.assert_allclose(matrix(again), matrix(flange), atol=1e-12)
-
-
-def test_gravity_torque_is_the_gradient_of_potential_energy(postures):
-    payload = ToolPayload(1.3, (0.01, -0.02, 0.06))
-    gravity = np.array([0.0, 1.0, -9.7])
-
-    def energy(q):
-        frames = [matrix(frame) for frame in Posture(floats(q)).frames()]
-        total = 0.0
-        masses = [*LINK_MASS_KG, payload.mass_kg]
-        centres = [*LINK_CENTRE_M, payload.cog_m]
-        for mass, centre, frame in zip(masses, centres, [*frames[1:], frames[-1]], strict=True):
-            total -= mass * gravity @ (frame @ [*centre, 1.0])[:3]
-        return total
-
-    for q in postures[:20]:
-        slope = [(energy(q + d) - energy(q - d)) / 2e-6 for d in 1e-6 * np.eye(6)]
-        torque = gravity_torque(Posture(floats(q)), floats(gravity), payload)
-        np.testing.assert_allclose(torque, slope, atol=1e-6)
-
-
-def test_momentum_of_an_arm_that_turns_about_its_base():
-    q = np.array([0.0, -0.4, 0.7, -0.3, 1.0, 0.2])
-    posture = Posture(floats(q))
-    first_moment = np.zeros(2)
-    for mass, centre, frame in zip(LINK_MASS_KG, LINK_CENTRE_M, posture.frames()[1:], strict=True):
-        first_moment += mass * (matrix(frame) @ [*centre, 1.0])[:2]
-    expected = 0.5 * np.linalg.norm(first_moment)
-    assert momentum(posture, (0.5, 0, 0, 0, 0, 0), ToolPayload()) == pytest.approx(expected)

@@ -23,7 +23,7 @@ def test_whatever_the_figures_the_controller_stands(make_client, odd):
                 figures[ACCELERATION_AT] = odd
             client.write(command, figures, [1] * 7)
             client.run(0.01)
-            for name in ("target_q", "actual_q", "target_TCP_pose", "tcp_offset", "target_moment"):
+            for name in ("target_q", "actual_q", "target_TCP_pose", "tcp_offset", "ft_raw_wrench"):
                 assert np.isfinite(client.output(name)).all(), (command, name)
 
 
