@@ -130,13 +130,13 @@ def _simulate_ur(options: argparse.Namespace) -> int:
     _check_ur(options)
     from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
     from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
-    from tactile_resonance.simulation.ur5e.controller import ControllerConfig, UrController
+    from tactile_resonance.simulation.ur5e.controller import UrController
     from tactile_resonance.simulation.ur5e.machine import MachineConfig
 
     nothing = options.tissue is None and options.scene is None
     tabletop = None if nothing else _tabletop(options)
     controller = UrController(
-        ControllerConfig(MachineConfig(tip_in_flange=TIP_IN_FLANGE.vector)),
+        MachineConfig(tip_in_flange=TIP_IN_FLANGE.vector),
         None if tabletop is None else tabletop.plant,
         seed=options.seed,
     )

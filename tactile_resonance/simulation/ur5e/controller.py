@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
@@ -31,6 +30,9 @@ from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, Sc
 _LOG_LINES = 200
 # Joints slower than this are at rest when power is removed [rad/s]; above their wander.
 _AT_REST_RAD_S = 0.05
+# Major, minor, bugfix, build.
+POLYSCOPE = (5, 21, 0, 0)
+SERIAL_NUMBER = "20265500001"
 
 
 class RuntimeState(IntEnum):
@@ -41,27 +43,6 @@ class RuntimeState(IntEnum):
     PLAYING = 2
 
 
-@dataclass(frozen=True)
-class ControllerConfig:
-    """A simulated controller.
-
-    Attributes
-    ----------
-    machine : MachineConfig
-        The arm, its tool, its limits.
-    polyscope : tuple of 4 int
-        Version: major, minor, bugfix, build.
-    serial_number : str
-    switching_s : float
-        Time that powering on and releasing the brakes take each [s].
-    """
-
-    machine: MachineConfig = field(default_factory=MachineConfig)
-    polyscope: tuple[int, int, int, int] = (5, 21, 0, 0)
-    serial_number: str = "20265500001"
-    switching_s: float = 0.2
-
-
 class UrController:
     """A UR5e and its controller.
 
@@ -69,7 +50,6 @@ class UrController:
 
     Attributes
     ----------
-    config : ControllerConfig
     machine : Machine
         The arm.
     safety : Safety
@@ -96,15 +76,14 @@ class UrController:
 
     def __init__(
         self,
-        config: ControllerConfig | None = None,
+        config: MachineConfig | None = None,
         environment: Environment | None = None,
         seed: Seed = 0,
     ) -> None:
-        self.config = config or ControllerConfig()
         self.machine: Machine = Machine(
-            self.config.machine, environment, np.random.default_rng(seed)
+            config or MachineConfig(), environment, np.random.default_rng(seed)
         )
-        self.safety: Safety = Safety(self.config.switching_s)
+        self.safety: Safety = Safety()
         self.registers: Registers = Registers()
         self.ports: Ports = Ports()
         self.program: Program | None = None
@@ -200,18 +179,13 @@ class UrController:
 
     def protective_stop(self, reason: str = "injected") -> None:
         """Stop, power kept, until unlocked; ends the program."""
-        self.safety.protective_stop(reason)
+        self.safety.protective_stop()
         self._end_program(f"protective stop: {reason}")
 
     def emergency_stop(self) -> None:
         """Press the emergency stop; ends the program."""
         self.safety.emergency_stop()
         self._end_program("emergency stop")
-
-    def violation(self, reason: str = "injected") -> None:
-        """Stop for a violated safety limit, until safety is restarted; ends the program."""
-        self.safety.violation(reason)
-        self._end_program(f"safety violation: {reason}")
 
     def power_off(self) -> None:
         """Close the brakes and remove power; ends the program."""

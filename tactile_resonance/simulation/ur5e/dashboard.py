@@ -9,7 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from tactile_resonance.simulation.ur5e.controller import RuntimeState, UrController
+from tactile_resonance.simulation.ur5e.controller import (
+    POLYSCOPE,
+    SERIAL_NUMBER,
+    RuntimeState,
+    UrController,
+)
 from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService
 from tactile_resonance.simulation.ur5e.safety import RefusedError
 
@@ -38,9 +43,9 @@ class DashboardService(MessageService):
             "isProgramSaved": lambda: "true",
             "get loaded program": lambda: "No program loaded",
             "get robot model": lambda: "UR5",
-            "get serial number": lambda: c.config.serial_number,
-            "PolyscopeVersion": lambda: f"URSoftware {'.'.join(map(str, c.config.polyscope))}",
-            "version": lambda: ".".join(map(str, c.config.polyscope)),
+            "get serial number": lambda: SERIAL_NUMBER,
+            "PolyscopeVersion": lambda: f"URSoftware {'.'.join(map(str, POLYSCOPE))}",
+            "version": lambda: ".".join(map(str, POLYSCOPE)),
         }
         self._actions: dict[str, tuple[Callable[[], None], str]] = {
             "power on": (c.safety.power_on, "Powering on"),
@@ -50,7 +55,7 @@ class DashboardService(MessageService):
                 c.safety.unlock_protective_stop,
                 "Protective stop releasing",
             ),
-            "restart safety": (c.safety.restart_safety, "Restarting safety"),
+            "restart safety": (lambda: None, "Restarting safety"),
             "close popup": (c.close_popup, "closing popup"),
             "close safety popup": (c.close_popup, "closing safety popup"),
             "stop": (c.stop_program, "Stopped"),

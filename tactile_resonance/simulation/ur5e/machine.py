@@ -296,11 +296,7 @@ class Machine:
 
     def within_limits(self, q: Six | None) -> bool:
         """Say whether joint angles, or None for a pose out of reach, are within the limits."""
-        limits = self.config.limits
-        if q is None or largest(q) > limits.joint_range_rad:
-            return False
-        place = Posture(q).tool(self.target.tcp)[1]
-        return all(plane.beyond(place) <= 0.0 for plane in limits.planes)
+        return q is not None and largest(q) <= self.config.limits.joint_range_rad
 
     def past_joints(self, steps: int) -> Six:
         """Return the joint angles of some cycles ago.

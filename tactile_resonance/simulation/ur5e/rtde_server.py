@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from tactile_resonance.simulation.ur5e.controller import UrController
+from tactile_resonance.simulation.ur5e.controller import POLYSCOPE, UrController
 from tactile_resonance.simulation.ur5e.outputs import OUTPUT_TYPES, READERS, Reader
 from tactile_resonance.simulation.ur5e.reactor import Connection
 from tactile_resonance.simulation.ur5e.registers import INPUT_TYPES
@@ -266,7 +266,7 @@ class _Service:
         return bytes([payload == struct.pack(">H", PROTOCOL_VERSION)])
 
     def _controller_version(self, _: bytes) -> bytes:
-        return struct.pack(">4I", *self._server.controller.config.polyscope)
+        return struct.pack(">4I", *POLYSCOPE)
 
     def _set_up_outputs(self, payload: bytes) -> bytes:
         if len(payload) < 8:

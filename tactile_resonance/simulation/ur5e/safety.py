@@ -24,7 +24,6 @@ class SafetyMode(IntEnum):
     NORMAL = 1
     PROTECTIVE_STOP = 3
     ROBOT_EMERGENCY_STOP = 7
-    VIOLATION = 8
 
 
 # Bits of RTDE output ``safety_status_bits``.
@@ -32,11 +31,12 @@ _STATUS_BITS = {
     SafetyMode.NORMAL: 1 << 0,
     SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
     SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
-    SafetyMode.VIOLATION: 1 << 8 | 1 << 10,
 }
 
 # After a protective stop the robot refuses to be unlocked for this long [s] (dashboard server manual).
 UNLOCK_DELAY_S = 5.0
+# Time that powering on and releasing the brakes take each [s]; seconds on a real robot.
+SWITCHING_S = 0.2
 
 
 class RefusedError(Exception):
@@ -50,17 +50,11 @@ class Safety:
     ----------
     robot_mode : RobotMode
     safety_mode : SafetyMode
-    reason : str
-        Of the last stop.
-    switching_s : float
-        Time that powering on and releasing brakes take each; seconds on a real robot.
     """
 
-    def __init__(self, switching_s: float) -> None:
+    def __init__(self) -> None:
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
-        self.reason = ""
-        self.switching_s = switching_s
         self._time_s = 0.0
         self._next_mode: RobotMode | None = None
         self._due_s = 0.0
@@ -86,8 +80,7 @@ class Safety:
         self._time_s = time_s
         if self._next_mode is not None and time_s >= self._due_s:
             self.robot_mode, self._next_mode = self._next_mode, None
-        powerless = (SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.VIOLATION)
-        if self.safety_mode in powerless and at_rest:
+        if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP and at_rest:
             self.power_off()
 
     def power_on(self) -> None:
@@ -109,11 +102,11 @@ class Safety:
         """Close the brakes and remove power."""
         self.robot_mode, self._next_mode = RobotMode.POWER_OFF, None
 
-    def protective_stop(self, reason: str) -> None:
+    def protective_stop(self) -> None:
         """Stop, power kept, until unlocked."""
         if self.safety_mode is SafetyMode.NORMAL:
             self.safety_mode = SafetyMode.PROTECTIVE_STOP
-            self.reason, self._stopped_s = reason, self._time_s
+            self._stopped_s = self._time_s
 
     def unlock_protective_stop(self) -> None:
         """End a protective stop.
@@ -134,26 +127,16 @@ class Safety:
 
     def emergency_stop(self) -> None:
         """Press the emergency stop: brake, then remove power."""
-        self.safety_mode, self.reason = SafetyMode.ROBOT_EMERGENCY_STOP, "emergency stop"
+        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
 
     def release_emergency_stop(self) -> None:
         """Release the button; the arm stays without power."""
         if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
             self.safety_mode = SafetyMode.NORMAL
 
-    def violation(self, reason: str) -> None:
-        """Stop for a limit found violated: brake, then remove power, until safety is restarted."""
-        self.safety_mode, self.reason = SafetyMode.VIOLATION, reason
-
-    def restart_safety(self) -> None:
-        """Restart after a violation; the arm is without power then."""
-        if self.safety_mode is SafetyMode.VIOLATION:
-            self.safety_mode = SafetyMode.NORMAL
-            self.power_off()
-
     def _require_normal(self, action: str) -> None:
         if self.safety_mode is not SafetyMode.NORMAL:
             raise RefusedError(f"cannot {action} in safety mode {self.safety_mode.name}")
 
     def _switch(self, mode: RobotMode) -> None:
-        self._next_mode, self._due_s = mode, self._time_s + self.switching_s
+        self._next_mode, self._due_s = mode, self._time_s + SWITCHING_S

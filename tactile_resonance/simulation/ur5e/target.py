@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from operator import sub
 
-from tactile_resonance.contact.vectors import NO_TURN, Turn, Vector, dot, transposed, turn_product
+from tactile_resonance.contact.vectors import NO_TURN, Turn, Vector, transposed, turn_product
 from tactile_resonance.simulation.ur5e.kinematics import Posture, nearest_inverse
 from tactile_resonance.simulation.ur5e.poses import (
     IDENTITY,
@@ -38,27 +38,6 @@ class ProtectiveStop(Exception):
 
 
 @dataclass(frozen=True)
-class SafetyPlane:
-    """A plane of the safety configuration that the TCP must not pass.
-
-    Attributes
-    ----------
-    point_m : Vector
-        A point of it in the base.
-    normal : Vector
-        Of length 1, to the side where the TCP may be.
-    """
-
-    point_m: Vector
-    normal: Vector
-
-    def beyond(self, place_m: Vector) -> float:
-        """How far a place is on the wrong side [m]; negative on the right one."""
-        (x, y, z), (px, py, pz) = place_m, self.point_m
-        return -dot(self.normal, (x - px, y - py, z - pz))
-
-
-@dataclass(frozen=True)
 class MotionLimits:
     """Limits of the arm and of its safety configuration.
 
@@ -75,8 +54,6 @@ class MotionLimits:
         configuration.
     brake_rad_s2 : float
         Deceleration of stops that no program asks for (assumed).
-    planes : tuple of SafetyPlane
-        The model stops at a plane; a robot slows down before it.
     """
 
     joint_range_rad: float = math.tau
@@ -84,7 +61,6 @@ class MotionLimits:
     tool_speed_m_s: float = 1.5
     tool_force_n: float = 150.0
     brake_rad_s2: float = 10.0
-    planes: tuple[SafetyPlane, ...] = ()
 
 
 class Target:
@@ -251,11 +227,6 @@ class Target:
     def _check(self, posture: Posture, qd: Six = ZERO) -> None:
         """Refuse a posture out of limits, and speeds: those given and those with which it is reached."""
         limits = self.limits
-        for plane in limits.planes:
-            here = plane.beyond(self.tool[1])
-            # a TCP found beyond, as after a change of TCP, may only come back
-            if plane.beyond(posture.tool(self._tcp)[1]) > max(0.0, here):
-                raise ProtectiveStop("the tool would pass a safety plane")
         reached = largest(posture.q)
         if reached > limits.joint_range_rad:
             raise ProtectiveStop(f"a joint would reach {reached:.3f} rad, beyond its range")

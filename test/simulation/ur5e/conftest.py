@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from tactile_resonance.simulation.ur5e.controller import ControllerConfig, UrController
+from tactile_resonance.simulation.ur5e.controller import UrController
 from tactile_resonance.simulation.ur5e.forces import FtSpecification
 from tactile_resonance.simulation.ur5e.machine import MachineConfig
 from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
@@ -91,7 +91,7 @@ def make_client() -> Callable[..., Client]:
     def make(environment=None, *, offset=0, seed=1, machine=None, **machine_fields) -> Client:
         fields = {"ft": EXACT_FT, "tracking": TrackingParameters(jitter_rms_m=0.0)}
         machine = MachineConfig(**{**fields, **machine_fields}) if machine is None else machine
-        return Client(UrController(ControllerConfig(machine), environment, seed), offset)
+        return Client(UrController(machine, environment, seed), offset)
 
     return make
 

@@ -7,7 +7,6 @@ import pytest
 from tactile_resonance.simulation.ur5e.controller import RuntimeState, UrController
 from tactile_resonance.simulation.ur5e.outputs import OUTPUT_TYPES
 from tactile_resonance.simulation.ur5e.safety import RefusedError, RobotMode, SafetyMode
-from tactile_resonance.simulation.ur5e.target import MotionLimits, SafetyPlane
 
 PROGRAM = """def rtde_control():
   global reg_offset_int = 0
@@ -80,20 +79,6 @@ def test_emergency_stop_removes_power_after_braking_and_recovers_in_order(moving
     assert controller.safety.robot_mode is RobotMode.RUNNING
     np.testing.assert_allclose(moving.output("actual_q"), stopped, atol=1e-12)
     controller.start_program(PROGRAM)
-
-
-def test_violation_needs_safety_to_be_restarted(moving):
-    controller = moving.controller
-    controller.violation("joint position")
-    run(controller, 0.5)
-    assert controller.outputs("safety_status_bits") >> 8 & 1
-    assert controller.safety.robot_mode is RobotMode.POWER_OFF
-    with pytest.raises(RefusedError, match="VIOLATION"):
-        controller.safety.brake_release()
-    controller.safety.restart_safety()
-    controller.safety.brake_release()  # powers on, too
-    run(controller, 0.5)
-    assert controller.safety.robot_mode is RobotMode.RUNNING
 
 
 def test_power_off_holds_the_arm_at_once(moving):
@@ -211,25 +196,6 @@ def test_same_seed_same_robot():
         run(controller, 0.05)
     assert one.outputs("ft_raw_wrench") == two.outputs("ft_raw_wrench")
     assert one.outputs("ft_raw_wrench") != other.outputs("ft_raw_wrench")
-
-
-def test_a_safety_plane_stops_the_tool_and_is_known_to_the_queries(make_client):
-    height = 0.4
-    plane = SafetyPlane((0.0, 0.0, height), (0.0, 0.0, 1.0))
-    client = make_client(limits=MotionLimits(planes=(plane,)))
-    pose = client.output("target_TCP_pose")
-    assert pose[2] > height
-    below = [*pose[:2], height - 0.001, *pose[3:]]
-    client.call(36, below)
-    assert client.answer == 0
-    client.call(36, [*pose[:2], height + 0.001, *pose[3:]])
-    assert client.answer == 1
-    client.stream(3, [*below, 0.05, 0.5])
-    client.run((pose[2] - height) / 0.05 + 0.5)
-    assert client.controller.program is None
-    assert "safety plane" in client.controller.safety.reason
-    # it brakes within tenths of a millimetre
-    assert client.output("target_TCP_pose")[2] == pytest.approx(height, abs=3e-4)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
