@@ -130,8 +130,7 @@ class ContactParameters:
     )
     carried_kg: float = within(
         *(0.0, 0.0, 5.0),
-        "Mass beyond a tool-mounted cell, whose inertia it feels [kg]; 0 under the sample, or "
-        "where the force source removes it.",
+        "Mass beyond a tool-mounted cell, whose inertia it feels [kg]; 0 under the sample.",
     )
     cell_lag_s: float = within(
         *(0.002, 0.0, 0.05),

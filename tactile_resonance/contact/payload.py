@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tool-mounted cell carries: its weight and inertia, and how to identify them from a few orientations.
+"""What a tool-mounted cell carries: its weight, and how to identify it from a few orientations.
 
-Newton and Euler for a rigid body hung on the cell: the body exerts ``m (g - a_c)`` on the cell and
-``c x m (g - a_c)`` about its origin, with a_c the acceleration of the centre of mass at c. The small body's
-own moment of inertia is neglected: a contact never turns it quickly.
+The body exerts ``m g`` on the cell and ``c x m g`` about its origin, with its centre of mass at c. Its inertia is taken
+off where a contact is controlled (`observer.Observer`).
 """
 
 from __future__ import annotations
@@ -15,12 +14,10 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import (
-    ZERO,
     Six,
     Turn,
     Vector,
     cross,
-    difference,
     rotated_back,
     scaled,
     vector,
@@ -53,23 +50,20 @@ class Payload:
         if np.shape(self.centre_m) != (3,) or not np.all(np.isfinite(self.centre_m)):
             raise ValueError(f"centre_m: {self.centre_m!r}, expected 3 finite numbers")
 
-    def wrench(self, turn: Turn, acceleration_m_s2: Vector = ZERO) -> Six:
+    def wrench(self, turn: Turn) -> Six:
         """Wrench of the payload on the cell, in the cell's frame.
 
         Parameters
         ----------
         turn : Turn
             Rotation from the cell's frame into the base.
-        acceleration_m_s2 : tuple of 3 floats
-            Of the centre of mass, in the base [m/s2].
 
         Returns
         -------
         tuple of 6 floats
             Force [N] and torque about the cell's origin [N m].
         """
-        field = rotated_back(turn, difference(_GRAVITY_M_S2, acceleration_m_s2))
-        force = scaled(self.mass_kg, field)
+        force = scaled(self.mass_kg, rotated_back(turn, _GRAVITY_M_S2))
         return *force, *cross(self.centre_m, force)
 
 

@@ -3,22 +3,17 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from operator import mul
-from typing import NamedTuple
 
 from tactile_resonance.contact.interfaces import Cell, ForceInfo, Mount
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
 from tactile_resonance.contact.vectors import (
     NO_TURN,
-    ZERO,
     Turn,
     Vector,
-    cross,
     difference,
     rotated,
     transposed,
@@ -26,32 +21,6 @@ from tactile_resonance.contact.vectors import (
     turn_product,
     vector,
 )
-
-
-class Motion(NamedTuple):
-    """Where the tip is and how it accelerates, in the base.
-
-    Attributes
-    ----------
-    position_m : tuple of 3 floats
-    turn : Turn
-        Rotation from the frame `tip` into the base.
-    acceleration_m_s2, angular_velocity_rad_s, angular_acceleration_rad_s2 : tuples of 3 floats
-    """
-
-    position_m: Vector
-    turn: Turn
-    acceleration_m_s2: Vector = ZERO
-    angular_velocity_rad_s: Vector = ZERO
-    angular_acceleration_rad_s2: Vector = ZERO
-
-    def acceleration_of(self, arm_m: Vector) -> Vector:
-        """Acceleration of a point of the tool, `arm_m` from the tip in the base [m/s2]."""
-        spin = self.angular_velocity_rad_s
-        x, y, z = self.acceleration_m_s2
-        ax, ay, az = cross(self.angular_acceleration_rad_s2, arm_m)
-        cx, cy, cz = cross(spin, cross(spin, arm_m))
-        return x + ax + cx, y + ay + cy, z + az + cz
 
 
 @dataclass(frozen=True)
@@ -92,38 +61,29 @@ class Mounting:
         """Rotation of the cell in what it sits on."""
         return turn_from_vector(vector(self.frame.rotation_rad))
 
-    @cached_property
-    def _centre_m(self) -> Vector:
-        """Of the payload's mass, in the frame `tip`."""
-        assert self.payload is not None
-        x, y, z = self._place_m
-        dx, dy, dz = rotated(self._turn, self.payload.centre_m)
-        return x + dx, y + dy, z + dz
-
-    def to_tip(self, samples: Iterable[CellSample], motion: Motion) -> list[WrenchSample]:
+    def to_tip(
+        self, samples: Iterable[CellSample], tip_m: Vector, tip_turn: Turn
+    ) -> list[WrenchSample]:
         """Wrenches of the tissue on the tip, from those on the cell.
 
-        On the tool the payload's weight and inertia are taken off and the cell passes on what the tip
-        feels; under the sample it feels the opposite.
+        On the tool the payload's weight is taken off and the cell passes on what the tip feels; under the
+        sample it feels the opposite.
 
         Parameters
         ----------
         samples : iterable of CellSample
-        motion : Motion
-            While they were measured.
+        tip_m, tip_turn : Vector, Turn
+            Place and orientation of the frame `tip` in the base while they were measured.
         """
         cfx = cfy = cfz = ctx = cty = ctz = 0.0  # what the cell carries
         if self.mount is Mount.TOOL:
             turn, lever = self._turn, self._place_m
             if self.payload is not None:
-                arm_m = rotated(motion.turn, self._centre_m)
-                cfx, cfy, cfz, ctx, cty, ctz = self.payload.wrench(
-                    turn_product(motion.turn, turn), motion.acceleration_of(arm_m)
-                )
+                cfx, cfy, cfz, ctx, cty, ctz = self.payload.wrench(turn_product(tip_turn, turn))
         else:
-            back = transposed(motion.turn)
+            back = transposed(tip_turn)
             turn = back if self._turn == NO_TURN else turn_product(back, self._turn)
-            lever = rotated(back, difference(self._place_m, motion.position_m))
+            lever = rotated(back, difference(self._place_m, tip_m))
         (a, b, c, d, e, f, g, h, i), (lx, ly, lz) = turn, lever
         if self.mount is Mount.TABLE:  # what acts on the sample, turned round
             a, b, c, d, e, f, g, h, i = -a, -b, -c, -d, -e, -f, -g, -h, -i
@@ -150,38 +110,14 @@ class TipForce:
     mounting : Mounting
     arm_state : callable
         Newest state of the arm, without waiting; what it raises is passed on.
-    inertia_window_s : float
-        The tip's acceleration, for the inertia of the payload, is the slope of its velocity over this long;
-        it is half of that late, and its noise is that of the velocity times ``sqrt(12 / n) / window`` for n
-        states. 0: inertia is left in the force.
 
     Attributes
     ----------
     cell : Cell
-
-    Raises
-    ------
-    ValueError
-        If the cell says that it is mounted elsewhere.
     """
 
-    def __init__(
-        self,
-        cell: Cell,
-        mounting: Mounting,
-        arm_state: Callable[[], ArmSample],
-        inertia_window_s: float = 0.0,
-    ) -> None:
-        if cell.info.mount is not mounting.mount:
-            raise ValueError(
-                f"mount: {cell.info.mount.value} for the cell, {mounting.mount.value} for its frame"
-            )
-        if not 0 <= inertia_window_s <= 1:
-            raise ValueError(f"inertia_window_s: {inertia_window_s!r}, expected 0 to 1 s")
+    def __init__(self, cell: Cell, mounting: Mounting, arm_state: Callable[[], ArmSample]) -> None:
         self.cell, self._mounting, self._arm_state = cell, mounting, arm_state
-        # without a payload there is no inertia to take off
-        self._window_ns = 0.0 if mounting.payload is None else inertia_window_s * 1e9
-        self._states: deque[ArmSample] = deque()
 
     @property
     def info(self) -> ForceInfo:
@@ -190,39 +126,16 @@ class TipForce:
 
     def start(self) -> None:
         """Start the cell. Raises `ForceError`."""
-        self._states.clear()
         self.cell.start()
 
     def read(self) -> list[WrenchSample]:
         """Wrenches since the last call, oldest first, with the newest pose. Raises `ForceError`."""
         samples = self.cell.read()
         state = self._arm_state()
-        if self._window_ns:
-            self._remember(state)
         if not samples:
             return []
-        return self._mounting.to_tip(samples, self._motion(state))
+        return self._mounting.to_tip(samples, state.position_m, turn_from_vector(state.rotation_rad))
 
     def close(self) -> None:
         """Close the cell."""
         self.cell.close()
-
-    def _remember(self, state: ArmSample) -> None:
-        states = self._states
-        if not states or state.time_ns > states[-1].time_ns:
-            states.append(state)
-        while state.time_ns - states[0].time_ns > self._window_ns:
-            states.popleft()
-
-    def _motion(self, state: ArmSample) -> Motion:
-        turn, states = turn_from_vector(state.rotation_rad), self._states
-        if len(states) < 3:
-            return Motion(state.position_m, turn)
-        times_s = [(other.time_ns - state.time_ns) * 1e-9 for other in states]
-        middle_s = sum(times_s) / len(times_s)
-        times_s = [time_s - middle_s for time_s in times_s]
-        power = sum(map(mul, times_s, times_s))
-        axes = zip(*(other.velocity for other in states), strict=True)
-        ax, ay, az, bx, by, bz = (sum(map(mul, times_s, axis)) / power for axis in axes)
-        spin = states[-1].velocity[3:]
-        return Motion(state.position_m, turn, (ax, ay, az), spin, (bx, by, bz))

@@ -32,7 +32,7 @@ from tactile_resonance.fields import (
 )
 
 LONGEST_S = 1.0
-"""Of delays and filters: with more, no contact is controlled."""
+"""Of delays: with more, no contact is controlled."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,6 @@ class ForceConfig:
         From the force to the time stamp, filters of the sensor included [s].
     payload : Payload or None
         What a cell on the tool carries.
-    inertia_window_s : float
-        See `contact.tip_force.TipForce`.
     limits : CellLimits
     resolution_n : float or None
         Smallest step [N]; None: a count of a cell on CAN.
@@ -98,13 +96,12 @@ class ForceConfig:
     name: str = ""
     latency_s: float = 0.0
     payload: Payload | None = None
-    inertia_window_s: float = 0.0
     limits: CellLimits = field(default_factory=CellLimits)
     resolution_n: float | None = None
 
     def __post_init__(self) -> None:
         check_above_zero(self, "rate_hz", "noise_rms_n", "range_n", "range_nm", "resolution_n")
-        check_within(self, latency_s=(0, LONGEST_S), inertia_window_s=(0, LONGEST_S))
+        check_within(self, latency_s=(0, LONGEST_S))
         good = self._step_n is not None
         require(good, "resolution_n", None, "a number above 0: not known of this source")
         silent_s = self.limits.silent_s

@@ -55,4 +55,4 @@ def force_source(
         cell = RtdeWrench(config, arm_state, clock, arm_clock_std_s)
     else:
         raise TypeError(f"no source of force for {type(config).__name__}")
-    return TipForce(cell, config.mounting, arm_state, config.inertia_window_s)
+    return TipForce(cell, config.mounting, arm_state)

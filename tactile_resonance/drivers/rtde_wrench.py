@@ -24,7 +24,6 @@ class RtdeWrench:
     Parameters
     ----------
     config : ForceConfig
-        Of kind rtde.
     arm_state : callable
         Newest state of the arm, without waiting; may raise `ArmError`.
     clock : Clock or None
@@ -40,8 +39,6 @@ class RtdeWrench:
         clock: Clock | None = None,
         clock_std_s: Callable[[], float] | None = None,
     ) -> None:
-        if config.kind != "rtde":
-            raise ValueError(f"kind: {config.kind!r}, expected rtde")
         mounting = config.mounting
         if mounting.frame.vector.any() or mounting.payload is not None:
             raise ValueError("frame, payload: expected zeros and none, the controller knows both")

@@ -32,15 +32,12 @@ class TopicWrench:
     ----------
     node : Node
     config : TopicForce
-        Of kind topic.
     clock : Clock
         On which wrenches are dated and silence is judged; stamps of messages are ROS time. Stamps of simulated
         time are those of its bench, and not judged.
     """
 
     def __init__(self, node: Node, config: TopicForce, clock: Clock | None = None) -> None:
-        if config.kind != "topic":
-            raise ValueError(f"kind: {config.kind!r}, expected topic")
         self._node, self._config = node, config
         self._clock: Clock = WallClock() if clock is None else clock
         self.arrivals = Arrivals()
