@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -41,6 +42,7 @@ class Cause(str, Enum):
     HELD = "held"
     REFUSED = "refused"
     BUSY = "busy"  # refused now, accepted once the tip is free
+    STOPPED = "stopped"  # with the node that made it
 
 
 class NotIdleError(ValueError):
@@ -113,3 +115,8 @@ class ContactResult:
     contact_s: float | None = None
     told_m: float | None = None
     zero_change_n: float | None = None
+
+
+def not_reached(cause: Cause, message: str) -> ContactResult:
+    """Return what became of a contact of which no figure is known."""
+    return ContactResult(False, cause, message, total_s=math.nan, peak_force_n=math.nan)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
+from typing import Any
 
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
@@ -17,7 +18,7 @@ from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.result import ContactResult, refusal_cause
+from tactile_resonance.contact.result import Cause, ContactResult, not_reached, refusal_cause
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.mechanics.indentation import BallTip
 from tactile_resonance.nodes import contact_devices
@@ -27,12 +28,8 @@ from tactile_resonance.nodes.contact_topics import ContactTopics
 from tactile_resonance.nodes.force_service import ForceService
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
 from tactile_resonance.nodes.indent_conduct import IndentConduct
-from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode, in_thread
-from tactile_resonance.nodes.messages import (
-    contact_feedback,
-    contact_goal,
-    contact_result,
-)
+from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode, end_goal, in_thread
+from tactile_resonance.nodes.messages import contact_feedback, contact_goal, contact_result
 from tactile_resonance.nodes.parameters import Parameter, values
 from tactile_resonance.nodes.running import POLES, run_node
 from tactile_resonance.nodes.stop_input import StopInput
@@ -142,20 +139,11 @@ class ContactNode(ManagedNode):
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
         self.serve(Trigger, "retract", self._on_retract)
         self._teller = self.every(FEEDBACK_EVERY_S, self._tell)
-        self.act(
-            MakeContact,
-            "make_contact",
-            self._on_goal,
-            on_cancel=lambda _: self._news.trigger(),
-            refusal=self._refusal,
-        )
-        self.act(
-            Indent,
-            "indent",
-            self._on_indent,
-            on_cancel=lambda _: self._news.trigger(),
-            refusal=self._refusal,
-        )
+        for kind, name, serve in (
+            (MakeContact, "make_contact", self._on_goal),
+            (Indent, "indent", self._on_indent),
+        ):
+            self.act(kind, name, serve, lambda _: self._news.trigger(), self._refusal)
 
     def activate(self) -> None:
         """Start the loop."""
@@ -229,11 +217,8 @@ class ContactNode(ManagedNode):
         def read() -> ContactGoal:
             return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
 
-        try:
-            outcome, _ = await self._outcome_of(goal, read)
-        except _NotDoneError as error:
-            return MakeContact.Result(cause=error.cause, message=str(error))
-        _end(goal, outcome.reached)
+        outcome, _ = await self._outcome_of(goal, read)
+        end_goal(goal, outcome.reached and not goal.is_cancel_requested)
         return contact_result(outcome)
 
     async def _on_indent(self, goal: ServerGoalHandle) -> Indent.Result:
@@ -247,18 +232,17 @@ class ContactNode(ManagedNode):
                 simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
             )
 
-        try:
-            outcome, test = await self._outcome_of(goal, read)
-        except _NotDoneError as error:
-            return Indent.Result(cause=error.cause, message=str(error))
-        result = test.result(outcome, self._arm.clock.ros_ns)
-        _end(goal, result.done)
+        outcome, test = await self._outcome_of(goal, read)
+        result = Indent.Result(cause=outcome.cause.value, message=outcome.message)
+        if test is not None:
+            result = test.result(outcome, self._arm.clock.ros_ns)
+        end_goal(goal, result.done and not goal.is_cancel_requested)
         return result
 
     async def _outcome_of(
         self, goal: ServerGoalHandle, read: Callable[[], ContactGoal | IndentConduct]
-    ) -> tuple[ContactResult, ContactGoal | IndentConduct]:
-        """What became of a goal, and what it was; where there is nothing it is aborted, and why is raised."""
+    ) -> tuple[ContactResult, Any]:
+        """What became of a goal, and what it was; None: it was not begun, or the node was stopped."""
         try:
             if self._thread is None:
                 raise ValueError("contact_node is not active")
@@ -276,15 +260,13 @@ class ContactNode(ManagedNode):
             self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
             self.health.error(f"refused: {error}")
-            goal.abort()
-            raise _NotDoneError(refusal_cause(error).value, str(error)) from None
+            return not_reached(refusal_cause(error), str(error)), None
         self._goal, self._finished = goal, Future()
         self._test = what if isinstance(what, IndentConduct) else None
         outcome: ContactResult | None = await self._finished
         self._goal = self._finished = self._test = None
         if outcome is None:
-            goal.abort()
-            raise _NotDoneError("stopped", "contact_node was stopped")
+            return not_reached(Cause.STOPPED, "contact_node was stopped"), None
         return outcome, what
 
     def _draw_back(self) -> None:
@@ -395,29 +377,6 @@ class ContactNode(ManagedNode):
             test.recorder.take(cycle)
         self._forces.take(cycle)
         self._topics.take(cycle, thread)
-
-
-class _NotDoneError(Exception):
-    """Nothing became of a goal.
-
-    Attributes
-    ----------
-    cause : str
-    """
-
-    def __init__(self, cause: str, message: str) -> None:
-        super().__init__(message)
-        self.cause = cause
-
-
-def _end(goal: ServerGoalHandle, done: bool) -> None:
-    """Tell the client of a goal how it ended."""
-    if goal.is_cancel_requested:
-        goal.canceled()
-    elif done:
-        goal.succeed()
-    else:
-        goal.abort()
 
 
 def main() -> None:

@@ -24,7 +24,13 @@ from tactile_resonance.action import MakeContact
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.result import Cause, ContactResult, NotIdleError, refusal_cause
+from tactile_resonance.contact.result import (
+    Cause,
+    ContactResult,
+    NotIdleError,
+    not_reached,
+    refusal_cause,
+)
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.nodes.messages import contact_result, time_message, write_force_over
 from tactile_resonance.nodes.running import STREAM
@@ -98,11 +104,7 @@ class Stays:
         return write_force_over(response, "", mean_n, 0.0, spread)
 
 
-def _not_reached(cause: Cause, message: str) -> ContactResult:
-    return ContactResult(False, cause, message, total_s=NAN, peak_force_n=NAN)
-
-
-DRAWN_BACK = _not_reached(Cause.CANCELLED, "drawn back on request")
+DRAWN_BACK = not_reached(Cause.CANCELLED, "drawn back on request")
 
 
 class IdealContact:
@@ -167,13 +169,13 @@ class IdealContact:
     def _make(self, request: MakeContact.Goal) -> ContactResult:
         """Bring the tip there, taking as long as a contact takes."""
         if not self._lock.acquire(blocking=False):
-            return _not_reached(Cause.BUSY, "goal: a contact is under way")
+            return not_reached(Cause.BUSY, "goal: a contact is under way")
         try:
             self._drawn_back.clear()  # a stop after this is seen in the wait, one before in the refusal
             try:
                 self._check(request)
             except ValueError as error:
-                return _not_reached(refusal_cause(error), str(error))
+                return not_reached(refusal_cause(error), str(error))
             return self._touch(request)
         finally:
             self._lock.release()
@@ -186,7 +188,7 @@ class IdealContact:
         place = request.pose.pose.position
         found = self._force_at(np.array([place.x, place.y, place.z]), request.force_n)
         if found is None:
-            missing = _not_reached(Cause.SURFACE_MISSING, "nothing to touch there")
+            missing = not_reached(Cause.SURFACE_MISSING, "nothing to touch there")
             return self._say(State.IDLE, missing)
         now_ns = self._now_ns()
         pose = PoseStamped(header=request.pose.header, pose=request.pose.pose)
