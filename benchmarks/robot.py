@@ -118,8 +118,8 @@ def measure(seconds: float, repetitions: int, priority: int) -> LinkResult:
             _rest(arm, 1.5)  # the clocks are related meanwhile
             stalls = order(HOST, "state")["stalls"]
             pairs = [_respond(arm, (-1) ** k) for k in range(repetitions)]
-            assert arm.client_pid is not None
-            pids = {"simulated robot": robot.pid, "client": arm.client_pid, "owner": os.getpid()}
+            assert arm.client is not None
+            pids = {"simulated robot": robot.pid, "client": arm.client.pid, "owner": os.getpid()}
             before = {name: cpu_s(pid) for name, pid in pids.items()}
             start_s = time.monotonic()
             arrivals, stamps = _watch(arm, seconds)

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from tactile_resonance.clock import Clock, Demand
+from tactile_resonance.clock import Clock, SimulatedClock, WallClock
 from tactile_resonance.contact.interfaces import (
     ArmError,
     ArmFault,
@@ -26,7 +26,6 @@ from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import (
     FAULTY,
     FRESH,
-    NOTHING,
     REVIVED,
     SPEED,
     STOP,
@@ -34,7 +33,7 @@ from tactile_resonance.drivers.ur_exchange import (
 )
 from tactile_resonance.drivers.ur_motion import REST
 from tactile_resonance.drivers.ur_states import PROGRAM_PLAYING, StateReader, stop_fault
-from tactile_resonance.drivers.ur_time import ArmTime, LedClock
+from tactile_resonance.drivers.ur_time import AskedClock, LedClock, client_name
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.
 ANSWER_S = 1.0
@@ -60,15 +59,27 @@ class UrArm:
     config : UrArmConfig
     time : str
         ``HOST:PORT`` of a simulated bench's time; empty: the arm lives by this machine's clock.
+
+    Attributes
+    ----------
+    clock : Clock
+        On which its states are dated.
+    led : LedClock or None
+        That of a loop, while it leads simulated time.
+    client : ClientProcess or None
+        None while none runs.
+    heard_s : float
+        When the robot was last heard, on this machine's monotonic clock [s].
     """
 
     def __init__(self, config: UrArmConfig, time: str = "") -> None:
         self.config, self.tip_in_tool = config, config.tip_in_flange
-        self._time = ArmTime(time)
-        self._dated = True  # False: states are dated once the loop knows the time again
-        self._pending: UrCommand | None = None  # sent with the next time that the loop waits for
-        self._heard_s = 0.0  # when the robot was last heard
-        self._client: ClientProcess | None = None
+        self.time_server = time
+        self.clock: Clock = WallClock()
+        self.led: LedClock | None = None
+        self.heard_s = 0.0
+        self.client: ClientProcess | None = None
+        self._asked: SimulatedClock | None = None
         self._stream: RtdeStream | None = None
         self._states: StateReader | None = None
         self._number = 0
@@ -81,20 +92,9 @@ class UrArm:
     # properties
 
     @property
-    def clock(self) -> Clock:
-        """Clock on which its states are dated."""
-        return self._time.clock
-
-    @property
-    def frames(self) -> int:
-        """Frames that the bus of the cell has sent, while a loop leads simulated time; else 0."""
-        return 0 if self._time.led is None else self._time.led.frames
-
-    @property
     def waits_for(self) -> str:
         """What has not answered for a second while a loop leads simulated time, for people; empty: nothing."""
-        client = self._client
-        return "" if client is None else self._time.waits_for(client, self._heard_s)
+        return "" if self.led is None else self.led.waits_for
 
     @property
     def clock_uncertainty_s(self) -> float:
@@ -104,9 +104,9 @@ class UrArm:
         return self._states.clock_std_s
 
     @property
-    def client_pid(self) -> int | None:
-        """Id of the client's process; None while none runs."""
-        return None if self._client is None else self._client.pid
+    def robot_port(self) -> int:
+        """Local port of the connection over which the robot sends its states; 0: none."""
+        return 0 if self._stream is None else self._stream.local_port
 
     # the contract
 
@@ -122,16 +122,16 @@ class UrArm:
             LINK_LOST, NOT_REMOTE, REGISTERS_IN_USE, PROGRAM_NOT_STARTED, PROTECTIVE_STOP,
             EMERGENCY_STOP, PROGRAM_STOPPED (not powered), COMMAND_REFUSED, CLIENT_DIED.
         """
-        if self._client is not None and self._connect_again():
+        if self.client is not None and self._connect_again():
             return
         self._begin()
-        client = ClientProcess(self.config, simulated_time=bool(self._time.address))
-        names = {"time": self._time.address, "time_name": self._time.client_name}
+        client = ClientProcess(self.config, simulated_time=bool(self.time_server))
+        names = {"time": self.time_server, "time_name": client_name()}
         self._ask({"name": "connect", "config": self.config.to_dict(), **names}, client)
-        if self._time.led is not None:
+        if self.led is not None:
             self._ask({"name": "lead"}, client)
-            self._dated = False  # time has gone on, and the loop has not received it
-        self._client = client  # not before: a loop in another thread would send commands to it
+            self.led.dated = False  # time has gone on, and the loop has not received it
+        self.client = client  # not before: a loop in another thread would send commands to it
         self._guard()
 
     def state(self) -> ArmSample:
@@ -189,101 +189,59 @@ class UrArm:
 
     def close(self) -> None:
         """Stop the arm and its program and end the client; never raises."""
-        if self._client is not None:
-            self._client.end()
+        if self.client is not None:
+            self.client.end()
         self._forget()
-        self.follow()
-        self._time.close()
+        if self.led is not None:
+            self.led.close()
+        if self._asked is not None:
+            self._asked.close()
+            self._asked, self.clock = None, WallClock()
 
     # simulated time, led by a loop
 
     def led_clock(self, cell: Cell, while_waiting: Callable[[], None]) -> LoopClock | None:
         """Simulated time, led from now on; None on the wall clock. See `contact.interfaces.NodeArm`."""
-        if not self._time.address:
-            return None
-        return LedClock(self, cell, while_waiting)
+        return LedClock(self, cell, while_waiting) if self.time_server else None
 
-    def lead(self, bus_port: Callable[[], int] = lambda: 0) -> None:
-        """Let simulated time go on only as far as `wait_until` asks for; does nothing on the wall clock.
+    def be_led(self, clock: LedClock | None) -> None:
+        """Date states on the clock of a loop that leads simulated time from now on; None: none does any more."""
+        self.led = clock
+        if clock is not None:
+            self.clock = clock.bench
+        else:
+            self.clock = AskedClock(self._asked) if self._asked else WallClock()
+        if self.client is not None:
+            self._ask({"name": "follow" if clock is None else "lead"})
 
-        Parameters
-        ----------
-        bus_port : callable
-            Local port of the connection to the bus of a load cell, whose frames `frames` counts; 0: none.
-        """
-        if self._time.address:
-            self._time.lead(bus_port)
-            self._ask({"name": "lead"})
-            self.ask_ns()
-            self._dated = False
+    def catch_up(self, robot_ns: int) -> None:
+        """Wait for the state that the bench has sent, of a time of the robot [ns]."""
+        assert self._stream is not None
+        assert self._states is not None
+        self._looked_ns = 0
+        self.receive(now_known=True)
+        while (newest := self._states.newest) is not None:
+            if round(newest.robot_time_s * 1e9) >= robot_ns:
+                return
+            select.select([self._stream], [], [], 0.1)
+            self.receive(now_known=True)
 
-    def follow(self) -> None:
-        """Lead no more: time goes on without this arm."""
-        if self._time.led is None:
-            return
-        pending, self._pending = self._pending, None
-        if self._client is not None and pending is not None:
-            self._client.send(pending)
-        self._time.follow()
-        if self._client is not None:
-            self._ask({"name": "follow"})
-
-    def wait_until(
-        self, time_ns: int, demand: Demand, while_waiting: Callable[[], None] | None = None
-    ) -> None:
-        """Let simulated time go on up to a time and wait for that, and for the robot's state at it.
-
-        What was commanded before has reached the robot by then.
-        """
-        led, client = self._time.led, self._client
-        assert led is not None
-        if client is None:
-            self._time.look_again()
-            return
-        self._time.name_ports(0 if self._stream is None else self._stream.local_port)
-        command, self._pending = self._pending or UrCommand(NOTHING), None
-
-        def check() -> None:
-            client.look()
-            self._read()  # a robot whose time stands repeats its state
-            if while_waiting is not None:
-                while_waiting()
-
-        try:
-            self._time.send(client, command, time_ns, demand)
-            while led.now_ns() < time_ns:
-                led.wait_told(check)
-            if not self._dated:
-                led.ask_ns()  # times received while it connected are of the past
-            self._looked_ns = 0
-            self._catch_up(led.robot_ns)
-            if not self._dated and self._states is not None:
-                self._states.date_anew()
-                self._dated = True
-        except ArmError:  # reported by `state`
-            self._time.look_again()
-
-    def ask_ns(self) -> int:
-        """Simulated time now [ns], also where it has gone on without the loop that leads it."""
-        assert self._time.led is not None
-        return self._time.led.ask_ns()
-
-    def hurry(self) -> None:
-        """Make a wait that does not demand time demand it: something needs it now. From any thread."""
-        client = self._client
-        if self._time.led is not None and client is not None:
-            self._time.hurry(client)
+    def date_anew(self) -> bool:
+        """Date the newest state now, where there is one: before, the time was not known; whether it was done."""
+        if self._states is not None:
+            self._states.date_anew()
+        return self._states is not None
 
     # helpers
 
     def _connect_again(self) -> bool:
         """Start the program again over a good connection; False where everything must be reconnected."""
-        assert self._client is not None
+        assert self.client is not None
         try:
             self._fresh()
         except ArmError:
-            if self._client is not None:  # else `_fresh` has ended it
-                self._client.end()
+            if self.client is not None:  # else `_fresh` has ended it
+                self.client.end()
             self._forget()
             return False
         assert self._states is not None
@@ -294,15 +252,18 @@ class UrArm:
         self._states.guard(False)
         self._ask({"name": "restart"})
         self._guard()
-        self._dated = self._time.led is None
+        if self.led is not None:
+            self.led.dated = False
         return True
 
     def _begin(self) -> None:
         """Receive the robot's states, and check that nothing forbids motion."""
         try:
-            self._time.begin()
+            if self.time_server and self._asked is None:
+                self._asked = SimulatedClock(self.time_server, f"{client_name()}: owner")
+                self.clock = AskedClock(self._asked)
             self._stream = RtdeStream(self.config.host, self.config.rate_hz)
-            trip_s = 0.0 if self._time.address else self._stream.round_trip_s
+            trip_s = 0.0 if self.time_server else self._stream.round_trip_s
             self._states = StateReader(self._stream, lambda: self.clock.now_ns(), trip_s)
             self._wait_for_first()
             self._check_stop()
@@ -340,7 +301,7 @@ class UrArm:
             if time.monotonic() > deadline:
                 raise ArmError(fault, otherwise)
             select.select([self._stream], [], [], 0.05)
-            self._read()
+            self.receive()
 
     def _check_stop(self) -> None:
         """Raise where something forbids motion whatever program runs."""
@@ -352,10 +313,10 @@ class UrArm:
             raise ArmError(*stop)
 
     def _ask(self, request: dict, client: ClientProcess | None = None) -> None:
-        client = client or self._client
+        client = client or self.client
         assert client is not None
         try:
-            client.ask(request, self._read)
+            client.ask(request, self.receive)
         except ArmError as error:
             client.end()
             runs = self._states is not None and self._states.newest is not None
@@ -370,47 +331,36 @@ class UrArm:
             raise
 
     def _send(self, kind: bytes, twist: Six, acceleration_m_s2: float) -> None:
-        assert self._client is not None
+        assert self.client is not None
         self._number += 1
         command = UrCommand(kind, self._number, 0, 0, twist, acceleration_m_s2)
         self._sent.append((self._number, kind, time.monotonic()))
-        if self._time.led is not None:
-            self._pending = command  # with the next word on the time
+        if self.led is not None:
+            self.led.pending = command  # with the next word on the time
         else:
-            self._client.send(command)
+            self.client.send(command)
 
-    def _read(self, now_known: bool = False) -> None:
+    def receive(self, now_known: bool = False) -> None:
         """Take the states that have come; `now_known`: the loop that leads has received the present time."""
         assert self._states is not None
         try:
             with self._reading:  # a loop may wait for a time while another thread connects
-                if self._states.read(now_known or self._time.led is None):
-                    self._heard_s = time.monotonic()
+                if self._states.read(now_known or self.led is None):
+                    self.heard_s = time.monotonic()
         except ConnectionError as error:
-            if self._client is not None:
-                self._client.end()
+            if self.client is not None:
+                self.client.end()
             self._forget()
             text = f"the connection to {self.config.host} is lost"
             raise ArmError(ArmFault.LINK_LOST, text) from error
 
-    def _catch_up(self, robot_ns: int) -> None:
-        """Wait for the state that the bench has sent."""
-        assert self._stream is not None
-        assert self._states is not None
-        self._read(now_known=True)
-        while (newest := self._states.newest) is not None:
-            if round(newest.robot_time_s * 1e9) >= robot_ns:
-                return
-            select.select([self._stream], [], [], 0.1)
-            self._read(now_known=True)
-
     def _fresh(self) -> ArmSample:
         """Return the newest state, and give the client a sign of life."""
         self._looked_ns = 0
-        if self._client is None or self._states is None:
+        if self.client is None or self._states is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
-        client, states, config = self._client, self._states, self.config
-        self._read()
+        client, states, config = self.client, self._states, self.config
+        self.receive()
         sample = states.sample
         assert sample is not None
         age_s = (self.clock.now_ns() - sample.time_ns) * 1e-9
@@ -419,7 +369,7 @@ class UrArm:
             seen |= FAULTY | REVIVED if states.revived else FAULTY
         client.look(seen)
         if age_s > GIVE_UP_S:
-            self._client.end()
+            self.client.end()
             self._forget()
             raise ArmError(ArmFault.LINK_LOST, f"the connection to {config.host} is lost")
         if age_s > config.max_state_age_s:
@@ -432,9 +382,9 @@ class UrArm:
         return sample
 
     def _check_commands(self) -> None:
-        assert self._client is not None
+        assert self.client is not None
         assert self._states is not None
-        sent, (done, refused) = self._sent, self._client.exchange.answered
+        sent, (done, refused) = self._sent, self.client.exchange.answered
         while sent and sent[0][0] <= done:
             number, kind, _ = sent.popleft()
             if number != refused or number <= self._refused:
@@ -443,22 +393,23 @@ class UrArm:
             if self._states.fault is not None:
                 return  # because of a stop, which the state reports
             name = {SPEED: "speed", STOP: "stop"}[kind]
-            said = self._client.last_error()
+            said = self.client.last_error()
             raise ArmError(ArmFault.COMMAND_REFUSED, f"the robot refused: {name}. {said}")
-        if self._time.led is None and sent and time.monotonic() - sent[0][2] > ANSWER_S:
+        if self.led is None and sent and time.monotonic() - sent[0][2] > ANSWER_S:
             text = f"no answer to a command after {ANSWER_S:g} s"
             raise ArmError(ArmFault.COMMAND_REFUSED, text)
 
     def _forget_commands(self) -> None:
         self._sent.clear()
-        self._pending = None
+        if self.led is not None:
+            self.led.pending = None
         self._refused = self._number
-        if self._client is not None:
-            self._client.exchange.beat()
+        if self.client is not None:
+            self.client.exchange.beat()
 
     def _forget(self) -> None:
         """Nothing is connected any more."""
-        self._client = self._states = None
+        self.client = self._states = None
         if self._stream is not None:
             self._stream.close()
             self._stream = None

@@ -20,7 +20,7 @@ PATIENCE_S = 60.0
 
 def tick(arm, cycles=1):
     """Let time go on by cycles of the robot, and wait for the state at its end."""
-    arm.wait_until(arm.clock.now_ns() + cycles * CYCLE_NS, Demand.FAST)
+    arm.led.wait_until(arm.clock.now_ns() + cycles * CYCLE_NS, Demand.FAST)
 
 
 def keep(arm, condition, limit_s=10.0):
@@ -63,9 +63,19 @@ def pass_time(arm, seconds):
         tick(arm)
 
 
-def led(arm):
-    """Whether time goes on as this arm's owner says."""
-    return hasattr(arm.clock, "wait_told")
+def nothing():
+    """While time stands."""
+
+
+def lead(arm):
+    """Let time go on only as this arm's owner says."""
+    arm.led_clock(None, nothing)
+
+
+def follow(arm):
+    """Let it go on without."""
+    if arm.led is not None:
+        arm.led.close()
 
 
 def connect_again(arm, attempts=3):
@@ -77,24 +87,24 @@ def connect_again(arm, attempts=3):
         except ArmError:
             if left == 1:
                 raise
-            if led(arm):
+            if arm.led is not None:
                 pass_time(arm, 0.1)  # while time stands the newest state shows what was before
             else:
                 time.sleep(0.5)
-    if not led(arm):
-        arm.lead()
+    if arm.led is None:
+        lead(arm)
     tick(arm)  # it is later than when time was told last
 
 
 @contextlib.contextmanager
 def left_alone(arm, robot):
     """Meanwhile time goes on by itself, and fast: for what is done at the robot."""
-    arm.follow()
+    follow(arm)
     with contextlib.closing(SimulatedClock(f"{robot.host}:{PORT}", "test")) as clock:
         clock.free(Demand.FAST)
         yield
-    if arm.client_pid is not None:
-        arm.lead()
+    if arm.client is not None:
+        lead(arm)
 
 
 def standing(arm, robot):

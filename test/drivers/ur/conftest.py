@@ -18,7 +18,7 @@ from tactile_resonance.processes import end_with_parent
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 sys.path.insert(0, str(Path(__file__).parent))
-from arms import ACCELERATION_M_S2, LAG_S, UP, connect_again, keep, keep_for
+from arms import ACCELERATION_M_S2, LAG_S, UP, connect_again, follow, keep, keep_for
 
 # Of the three numbers after 127 two say which test run, the last which robot of it.
 RUN = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}"
@@ -111,7 +111,7 @@ def arm(robot, module_arm):
     """A connected arm that the test leads; connecting one that is healthy does nothing."""
     connect_again(module_arm)
     yield module_arm
-    module_arm.follow()
+    follow(module_arm)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arms import ACCELERATION_M_S2, CYCLE_NS, PATIENCE_S, UP, LateSocket
+from arms import ACCELERATION_M_S2, CYCLE_NS, PATIENCE_S, UP, LateSocket, nothing
 
 from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
@@ -20,10 +20,6 @@ from tactile_resonance.drivers.ur_time import LedClock
 pytest.importorskip("can", reason="python-can is not installed")
 
 from tactile_resonance.drivers.can_wrench import CanWrench
-
-
-def nothing():
-    """While time stands."""
 
 
 @pytest.fixture
@@ -75,9 +71,9 @@ def test_each_period_brings_the_state_at_its_end_and_all_its_wrenches(arm, cell,
         if held_up == "frames" and n in (0, 30):
             cell._bus._socket = LateSocket(cell._bus._socket, 0.01)
         cycles = int(rng.choice([1, 1, 2, 5]))
-        until_ns, frames = clock.now_ns() + cycles * CYCLE_NS, arm.frames
+        until_ns, frames = clock.now_ns() + cycles * CYCLE_NS, clock.bench.frames
         clock.wait_until(until_ns)
-        assert arm.frames - frames == 4 * cycles  # two a wrench, 1 kHz
+        assert clock.bench.frames - frames == 4 * cycles  # two a wrench, 1 kHz
         if held_up == "the loop" and rng.random() < 0.1:
             time.sleep(rng.uniform(0, 0.05))
         assert clock.now_ns() == until_ns

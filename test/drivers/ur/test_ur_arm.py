@@ -108,7 +108,7 @@ def test_link_is_given_up_where_the_network_stays_frozen(robot, high):
         after_s = (high.clock.now_ns() - begun_ns) * 1e-9
     assert fault is ArmFault.LINK_LOST
     assert after_s == pytest.approx(ur_arm.GIVE_UP_S, abs=0.01)
-    assert high.client_pid is None
+    assert high.client is None
 
 
 def test_short_freeze_is_survived(robot, high):
@@ -196,7 +196,7 @@ def test_emergency_stop(robot, high):
 def test_client_dies_in_the_middle_of_a_motion(robot, high, number):
     high.speed(DOWN, ACCELERATION_M_S2)
     keep_for(high, 0.1)
-    client = high.client_pid
+    client = high.client.pid
     os.kill(client, number)
     error, _ = wait_for_fault(high)
     assert error.fault is ArmFault.CLIENT_DIED
@@ -214,7 +214,7 @@ from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig
 arm = UrArm(UrArmConfig(sys.argv[1], max_state_age_s=1.0), sys.argv[1] + ":30021")
 arm.connect()
-print(arm.client_pid, flush=True)
+print(arm.client.pid, flush=True)
 while True:
     arm.speed(np.array([0, 0, 0.002, 0, 0, 0]), 0.5)
     time.sleep(0.01)

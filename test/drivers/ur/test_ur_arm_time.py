@@ -22,6 +22,7 @@ from arms import (
     connect_again,
     keep_for,
     left_alone,
+    nothing,
     tick,
 )
 
@@ -188,7 +189,7 @@ def test_a_machine_that_holds_things_up_changes_nothing(start_robots, start_arm)
         if who == 0:
             time.sleep(seconds)
             return
-        pid = arms[1].client_pid if who == 1 else held.process.pid
+        pid = arms[1].client.pid if who == 1 else held.process.pid
         os.kill(pid, signal.SIGSTOP)
         threading.Timer(seconds, os.kill, (pid, signal.SIGCONT)).start()
 
@@ -204,7 +205,7 @@ def test_a_machine_that_holds_things_up_changes_nothing(start_robots, start_arm)
     ("who", "name"), [("client", "the arm's client process"), ("robot", "the simulated robot")]
 )
 def test_what_holds_the_time_is_named_and_nothing_is_lost(robot, high, who, name):
-    pid = high.client_pid if who == "client" else robot.process.pid
+    pid = high.client.pid if who == "client" else robot.process.pid
     high.speed(UP, ACCELERATION_M_S2)
     keep_for(high, 0.1)
     assert high.waits_for == ""
@@ -218,8 +219,10 @@ def test_what_holds_the_time_is_named_and_nothing_is_lost(robot, high, who, name
             released.append(True)
 
     try:
-        high.wait_until(before_ns + CYCLE_NS, Demand.FAST, while_waiting)
+        high.led.while_waiting = while_waiting
+        tick(high)
     finally:
+        high.led.while_waiting = nothing
         os.kill(pid, signal.SIGCONT)
     assert name in named
     assert set(named) <= {"", name}
@@ -234,15 +237,13 @@ def test_what_is_raised_while_it_waits_ends_the_wait(robot, high):
         raise InterruptedError
 
     try:
+        high.led.while_waiting = enough
         with pytest.raises(InterruptedError):
-            tick_waiting(high, enough)
+            tick(high)
     finally:
+        high.led.while_waiting = nothing
         os.kill(robot.process.pid, signal.SIGCONT)
     keep_for(high, 0.1)
-
-
-def tick_waiting(arm, while_waiting):
-    arm.wait_until(arm.clock.now_ns() + CYCLE_NS, Demand.FAST, while_waiting)
 
 
 def test_a_wait_without_need_stands_until_it_is_hurried(robot, high):
@@ -252,12 +253,12 @@ def test_a_wait_without_need_stands_until_it_is_hurried(robot, high):
     ) as conductor:
         begun_ns = high.clock.now_ns()
         waiting = threading.Thread(
-            target=lambda: high.wait_until(begun_ns + 10 * CYCLE_NS, Demand.NONE)
+            target=lambda: high.led.wait_until(begun_ns + 10 * CYCLE_NS, Demand.NONE)
         )
         waiting.start()
         time.sleep(0.3)
         assert conductor.ask_ns() == begun_ns
-        high.hurry()
+        high.led.hurry()
         waiting.join(PATIENCE_S)
         assert high.clock.now_ns() == begun_ns + 10 * CYCLE_NS
 
@@ -281,9 +282,9 @@ def test_a_loop_that_dies_while_it_leads_holds_nothing(robot, start_arm, module_
     connect_again(arm)
     arm.speed(UP, ACCELERATION_M_S2)
     keep_for(arm, 0.1)
-    os.kill(arm.client_pid, signal.SIGKILL)
-    arm._time.led.close()
-    arm._time._asked.close()
+    os.kill(arm.client.pid, signal.SIGKILL)
+    arm.led.bench.close()
+    arm._asked.close()
     robot.until(runtime_state="STOPPED")  # by its watchdog: time goes on
 
 

@@ -105,14 +105,14 @@ def test_network_is_frozen_for_longer_than_the_library_bears(moving):
 def test_owner_that_falls_silent_is_left_to_the_watchdog(moving):
     """The client feeds the watchdog for `owner_timeout_s` of this machine's time."""
     robot, arm = moving
-    client = arm.client_pid
+    client = arm.client.pid
     drive(arm, lambda: stands(robot))  # looks at the robot, not at the arm
     assert any("watchdog" in line for line in robot.order("log")["log"][-3:])
     with pytest.raises(ArmError) as error:
         arm.speed(DOWN, ACCELERATION_M_S2)
     assert error.value.fault is ArmFault.PROGRAM_STOPPED
     arm.connect()
-    assert arm.client_pid == client
+    assert arm.client.pid == client
     # at rest nothing is asked of the owner
     time.sleep(arm.config.owner_timeout_s + 3 / arm.config.watchdog_hz)
     drive(arm, lambda: arm.state().moving_allowed)
@@ -120,16 +120,16 @@ def test_owner_that_falls_silent_is_left_to_the_watchdog(moving):
 
 def test_client_that_hangs_is_left_to_the_watchdog(moving):
     robot, arm = moving
-    client = arm.client_pid
+    client = arm.client.pid
     os.kill(client, signal.SIGSTOP)
     assert fault_of(arm) in (ArmFault.PROGRAM_STOPPED, ArmFault.COMMAND_REFUSED)
     drive(arm, lambda: stands(robot))
     assert any("watchdog" in line for line in robot.order("log")["log"][-3:])
-    arm._client._connect_timeout_s = 1.0  # it does not answer, however long that is
+    arm.client._connect_timeout_s = 1.0  # it does not answer, however long that is
     with pytest.raises(ArmError):
         arm.connect()
     connect_again(robot, arm)
-    assert arm.client_pid != client
+    assert arm.client.pid != client
 
 
 @pytest.mark.skipif(not may_take_priority(20), reason="real-time priority is not permitted")
@@ -142,8 +142,8 @@ def test_of_a_client_with_priority_the_thread_of_the_library_alone_has_none(movi
         connect_again(robot, arm)
     finally:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    first, *others = sorted(map(int, os.listdir(f"/proc/{arm.client_pid}/task")))
-    assert first == arm.client_pid
+    first, *others = sorted(map(int, os.listdir(f"/proc/{arm.client.pid}/task")))
+    assert first == arm.client.pid
     assert os.sched_getscheduler(first) == os.SCHED_FIFO
     assert [os.sched_getscheduler(thread) for thread in others] == [os.SCHED_OTHER]
     from tactile_resonance.drivers.ur_session import SLACK_NS  # ur_rtde is here
