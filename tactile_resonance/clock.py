@@ -227,13 +227,13 @@ class SimulatedClock(OfRosTime):
         while self._now_ns < time_ns:
             self.wait_told(while_waiting)
 
-    def sleep_until(self, time_ns: int, while_waiting: Callable[[], None] | None = None) -> None:
+    def sleep_until(self, time_ns: int) -> None:
         """Wait until a time [ns] is reached, without holding time up or demanding that it pass."""
         if time_ns <= self._now_ns:
             return
         self._send(ToBench.WAKE, time_ns)
         while self._now_ns < time_ns:
-            self.wait_told(while_waiting)
+            self.wait_told()
 
     def wait_told(self, while_waiting: Callable[[], None] | None = None) -> None:
         """Wait until the bench reports a time that was waited for."""

@@ -11,9 +11,9 @@ from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.tare import Zero
 from tactile_resonance.contact.tip_path import ARRIVED_RAD, TipPath, TurningWay
 from tactile_resonance.contact.vectors import Vector, added, scaled, vector
-from tactile_resonance.contact.zero import Zero
 
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""

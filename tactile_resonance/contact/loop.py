@@ -33,7 +33,6 @@ class Cycle(NamedTuple):
     arm: ArmSample | None
     wrenches: list[WrenchSample]
     state: State
-    late_s: float
     bias_n: Vector  # of the last tare, not taken off the wrenches
     bias_std_n: float  # its standard deviation along the normal
     fault: ArmError | ForceError | None  # what a device raised in this cycle
@@ -163,7 +162,7 @@ class ContactLoop:
         self._next_ns += period_ns * controller.periods
         if self._listener is not None:
             zero = controller.bias_n, controller.bias_std_n
-            cycle = Cycle(now, arm, wrenches, controller.state, late_ns * 1e-9, *zero, fault)
+            cycle = Cycle(now, arm, wrenches, controller.state, *zero, fault)
             self._listener(cycle)
 
     def bring_to_rest(self) -> str:

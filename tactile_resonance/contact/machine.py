@@ -27,10 +27,10 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.pressing import Pressing
 from tactile_resonance.contact.result import Breach, Cause, ContactResult, NotIdleError
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
+from tactile_resonance.contact.tare import Zero
 from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.vectors import Vector, dot, vector
 from tactile_resonance.contact.withdrawal import Withdrawal
-from tactile_resonance.contact.zero import Zero
 
 RELIEVING = (*TOUCHING, State.RETRACT)
 """States in which force is taken off as fast as it may be."""

@@ -13,9 +13,8 @@ from tactile_resonance.contact.force_watch import ForceWatch
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
-from tactile_resonance.contact.tare import TareError, tare
+from tactile_resonance.contact.tare import TareError, Zero, tare
 from tactile_resonance.contact.vectors import vector
-from tactile_resonance.contact.zero import Zero
 
 
 class ArmModel:

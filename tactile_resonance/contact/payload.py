@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a tool-mounted cell carries: its weight, and how to identify it from a few orientations.
 
-The body exerts ``m g`` on the cell and ``c x m g`` about its origin, with its centre of mass at c. Its inertia is taken
-off where a contact is controlled (`observer.Observer`).
+The body exerts ``m g`` on the cell and ``c x m g`` about its origin, with its centre of mass at c. Its inertia
+is taken off where a contact is controlled (`observer.Observer`).
 """
 
 from __future__ import annotations

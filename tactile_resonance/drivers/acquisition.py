@@ -28,8 +28,6 @@ class DeviceInfo:
     between_samples : BetweenSamples
     output_peak_v : float
         Largest voltage it can put out.
-    latency_s : float
-        From the start of the output to its arrival in the input; NaN where unknown.
     channel_delay_s : float
         Of the sensor channel behind the actuator channel; NaN where unknown.
     anti_alias_filter : str
@@ -43,7 +41,6 @@ class DeviceInfo:
     input_kind: InputKind
     between_samples: BetweenSamples
     output_peak_v: float
-    latency_s: float = float("nan")
     channel_delay_s: float = float("nan")
     anti_alias_filter: str = ""
     frame_id: str = ""

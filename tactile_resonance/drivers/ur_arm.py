@@ -26,12 +26,12 @@ from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import (
     FAULTY,
     FRESH,
+    REST,
     REVIVED,
     SPEED,
     STOP,
     UrCommand,
 )
-from tactile_resonance.drivers.ur_motion import REST
 from tactile_resonance.drivers.ur_states import PROGRAM_PLAYING, StateReader, stop_fault
 from tactile_resonance.drivers.ur_time import AskedClock, LedClock, client_name
 
@@ -205,7 +205,7 @@ class UrArm:
         return LedClock(self, cell, while_waiting) if self.time_server else None
 
     def be_led(self, clock: LedClock | None) -> None:
-        """Date states on the clock of a loop that leads simulated time from now on; None: none does any more."""
+        """Date states on the clock of a loop that leads simulated time from now on; None: none does."""
         self.led = clock
         if clock is not None:
             self.clock = clock.bench
@@ -227,7 +227,7 @@ class UrArm:
             self.receive(now_known=True)
 
     def date_anew(self) -> bool:
-        """Date the newest state now, where there is one: before, the time was not known; whether it was done."""
+        """Date the newest state, of an unknown time, now; whether there is one."""
         if self._states is not None:
             self._states.date_anew()
         return self._states is not None

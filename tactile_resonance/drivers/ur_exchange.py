@@ -17,6 +17,7 @@ _BEAT, _SEEN, _DONE, _REFUSED, _HEARD = 0, 8, 16, 24, 32
 
 SPEED, STOP, NOTHING = b"s", b"t", b"-"
 _COMMAND = struct.Struct("<cxxxxxxxqqq7d")
+REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 # Exit statuses of the client process; any other is a death.
 EXIT_ORDERLY, EXIT_BROKEN, EXIT_LINK_LOST = 0, 1, 3
@@ -42,7 +43,7 @@ class UrCommand(NamedTuple):
     number: int = 0
     until_ns: int = 0
     demand: int = 0
-    twist: tuple[float, ...] = (0.0,) * 6
+    twist: tuple[float, ...] = REST
     acceleration: float = 0.0
 
     def pack(self) -> bytes:

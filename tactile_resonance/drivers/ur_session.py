@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot made ready: ur_rtde connected, its program started, TCP, payload and watchdog set.
+"""A robot made ready: ur_rtde connected, its program started, TCP, payload and watchdog set; its velocities.
 
 Only the client process of `UrArm` imports this: the library may hang, and may abort the process.
 """
@@ -11,6 +11,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import dashboard_client
 import rtde_control
@@ -18,7 +19,7 @@ import rtde_control
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
-from tactile_resonance.drivers.ur_motion import UrMotion
+from tactile_resonance.drivers.ur_exchange import REST
 from tactile_resonance.processes import loose_timers, take_priority, thread_ids
 
 # The library watches the robot in a thread that wakes for every state; commands need no more than this, and at
@@ -30,6 +31,59 @@ SLACK_NS = 4_000_000
 HANG_S = 20
 # From clearing the command register to sending a program that reads it, by another connection.
 CLEARING_S = 0.05
+# speedL hands the newest velocity to the arm once a cycle of an e-series; it is no dead-man's switch.
+CYCLE_S = 0.002
+
+
+class UrMotion:
+    """Speeds and stops, in the order that the robot's program understands; each says whether it took it.
+
+    A velocity is not acknowledged: it stands in the command register until the robot's program looks, once a
+    cycle. The library's ``kickWatchdog`` writes zero into that register, and where both arrive within one cycle
+    (the robot's own, or a network that held packets back) the velocity is lost, be it the zero of a stop. So
+    once a velocity was sent the watchdog is fed by sending the newest velocity again. A stop is a velocity of
+    zero: the library's own ``speedStop`` waits for longer than the watchdog allows.
+
+    Parameters
+    ----------
+    control : rtde_control.RTDEControlInterface
+
+    Attributes
+    ----------
+    packets : int
+        Sent to the robot by these calls.
+    """
+
+    def __init__(self, control: Any) -> None:
+        self._control = control
+        self._twist: tuple[float, ...] = REST
+        self._acceleration_m_s2: float | None = None  # None: no velocity was sent yet
+        self.packets = 0
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the arm moves, or would without end, by a command of ours."""
+        return any(self._twist)
+
+    def speed(self, twist: tuple[float, ...], acceleration: float) -> bool:
+        """Follow a twist until the next call."""
+        self._twist, self._acceleration_m_s2 = twist, acceleration
+        return self.feed()
+
+    def rest(self, deceleration: float) -> None:
+        """Want no velocity any more: from now on the watchdog is fed with zero."""
+        self._twist, self._acceleration_m_s2 = REST, deceleration
+
+    def stop(self, deceleration: float) -> bool:
+        """Brake and stand."""
+        return self.speed(REST, deceleration)
+
+    def feed(self) -> bool:
+        """Keep the robot's watchdog quiet without changing what the arm does."""
+        self.packets += 1
+        if self._acceleration_m_s2 is None:
+            return self._control.kickWatchdog()
+        return self._control.speedL(self._twist, self._acceleration_m_s2, CYCLE_S)
 
 
 class Session:

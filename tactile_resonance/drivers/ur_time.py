@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The time of a simulated bench for an arm: asked for where it is needed, or led by a control loop.
 
-Where a loop leads it, time goes on up to that which the loop sends with each command; the arm's client process, which
-receives the commands, passes that on to the bench.
+Where a loop leads it, time goes on up to that which the loop sends with each command; the arm's client process,
+which receives the commands, passes that on to the bench.
 """
 
 from __future__ import annotations

@@ -209,7 +209,6 @@ class BenchDevice:
             input_kind=InputKind.MEASURED,
             between_samples=BetweenSamples.BAND_LIMITED,
             output_peak_v=float("inf"),
-            latency_s=0.0,
             channel_delay_s=0.0,
             anti_alias_filter="ideal",
         )

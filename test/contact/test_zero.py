@@ -4,8 +4,7 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.tare import Tare
-from tactile_resonance.contact.zero import Zero
+from tactile_resonance.contact.tare import Tare, Zero
 
 WALK, STD_N, EVERY_S = 5e-5, 9e-5, 2.5
 

@@ -22,8 +22,8 @@ from tactile_resonance.commands.bench_scan import Job, node_parameters
 from tactile_resonance.commands.calibrate_table import NODES, SIMULATED_POINTS, TRUTH, true_table
 from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.client import HANGS_S, ScanClient
-from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import STREAM
+from tactile_resonance.nodes.scan_node import RUNNING
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.table_calibration import read_table
 

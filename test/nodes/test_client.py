@@ -23,9 +23,8 @@ from tactile_resonance.msg import PointResult
 from tactile_resonance import client as client_module
 from tactile_resonance.client import CalibrationOutcome, Ending, ScanOutcome, TactileClient
 from tactile_resonance.nodes import goals, scan_node
-from tactile_resonance.nodes.one_goal import RUNNING
 from tactile_resonance.nodes.running import POLES, initialised
-from tactile_resonance.nodes.scan_node import ScanNode
+from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.run_content import checksum_of
 from test.spinning import spin_until

@@ -62,7 +62,7 @@ class Contact(ManagedNode):
             time_ns = BEGAN_NS + (tick + 2) * MS
             arm = ArmSample(time_ns, 0.0, (0.1, 0.2, 1e-4 * tick), (0.0, 0.0, 0.5), (0.0,) * 6)
             zero = (0.0, 0.0, BIAS_N), ZERO_STD_N
-            self.forces.take(Cycle(time_ns, arm, wrenches, state, 0.0, *zero, fault))
+            self.forces.take(Cycle(time_ns, arm, wrenches, state, *zero, fault))
 
 
 @pytest.fixture

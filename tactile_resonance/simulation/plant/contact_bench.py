@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from tactile_resonance.clock import Demand
+from tactile_resonance.clock import Demand, OfRosTime
 from tactile_resonance.contact.interfaces import (
     ArmError,
     ArmFault,
@@ -48,7 +48,7 @@ CELL_DELAY_NS = 1_000_000
 """From a measurement of the cell to its arrival."""
 
 
-class VirtualBench:
+class VirtualBench(OfRosTime):
     """Robot, plant and time. It is the clock of the control loop.
 
     Parameters
@@ -90,17 +90,6 @@ class VirtualBench:
     def now_ns(self) -> int:
         """Virtual time since the start [ns]."""
         return self.time_ns
-
-    @property
-    def simulated(self) -> bool:
-        """It is."""
-        return True
-
-    def ros_ns(self, time_ns: int) -> int:
-        """The same time: that of the simulation [ns]."""
-        return time_ns
-
-    own_ns = ros_ns
 
     def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
         """Let whole periods pass until a time is reached, whatever the demand."""

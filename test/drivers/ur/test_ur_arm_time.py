@@ -30,7 +30,6 @@ from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import NOTHING, SIZE, SPEED, Exchange, UrCommand
-from tactile_resonance.drivers.ur_motion import UrMotion
 from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
 
 
@@ -81,6 +80,7 @@ def test_the_bench_is_told_how_many_packets_are_on_their_way():
     """So it waits for a velocity that was sent before the time was let go on."""
     pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
     from tactile_resonance.drivers.ur_client import Client
+    from tactile_resonance.drivers.ur_session import UrMotion
 
     held, control = [], SimpleNamespace(speedL=lambda *_: True, kickWatchdog=lambda: True)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -15,6 +15,7 @@ from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.drivers.ur_exchange import (
     FRESH,
     NOTHING,
+    REST,
     REVIVED,
     SIZE,
     SPEED,
@@ -22,7 +23,6 @@ from tactile_resonance.drivers.ur_exchange import (
     Exchange,
     UrCommand,
 )
-from tactile_resonance.drivers.ur_motion import REST, UrMotion
 from tactile_resonance.drivers.ur_states import StateReader, motion_fault
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
@@ -214,6 +214,9 @@ class Control:
 
 
 def test_the_watchdog_is_fed_with_the_newest_velocity_and_never_with_an_older_one():
+    pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
+    from tactile_resonance.drivers.ur_session import UrMotion
+
     control = Control()
     motion = UrMotion(control)
     twist = (0.0, 0.0, -0.005, 0.0, 0.0, 0.0)
