@@ -47,10 +47,6 @@ class PolesTouch:
         """Whether the reference is there."""
         return len(self._air) == self._blocks
 
-    def reset(self) -> None:
-        """Forget the reference."""
-        self._air.clear()
-
     def add_air(self, pole: ArrayLike, covariance: ArrayLike) -> None:
         """Take a block of which is known that the tip was in air; more than needed replace the oldest."""
         p, c = _checked(pole, covariance)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
-from typing import Protocol
 
 from geometry_msgs.msg import PoseStamped
 
@@ -34,30 +33,21 @@ DISCOVERED_WITHIN_S = 10.0
 POLL_S = 5e-4
 
 
-class ContactSource(Protocol):
-    """Place and force over a past interval; called from a thread other than the executor's."""
-
-    def over(self, start_ns: int, end_ns: int) -> Contact:
-        """Contact from one ROS time to another [ns]; with a reason where the force is unknown."""
-        ...
-
-
-def make_contact_source(node: ManagedNode) -> ContactSource:
-    """The source that the node's parameter names."""
+def make_contact_source(node: ManagedNode) -> MeasuredContact | PublishedPlace:
+    """The source that the node's parameter names, for a thread other than the executor's."""
     (name,) = values(node, PARAMETER.name)
     return MeasuredContact(node) if name == "force_over" else PublishedPlace(node)
 
 
 class MeasuredContact:
-    """By the service `force_over`."""
+    """Place and force over a past interval by the service `force_over`."""
 
     def __init__(self, node: ManagedNode) -> None:
-        self._client = node.create_client(ForceOver, "force_over")
-        node.resources.callback(node.destroy_client, self._client)
+        self._client = node.client_of(ForceOver, "force_over")
         self._within_s = node.hung_after_s if node.time_server else ANSWER_WITHIN_S
 
     def over(self, start_ns: int, end_ns: int) -> Contact:
-        """See `ContactSource`."""
+        """Contact from one ROS time to another [ns]; with a reason where the force is unknown."""
         deadline = time.monotonic() + min(self._within_s, DISCOVERED_WITHIN_S)
         while not self._client.service_is_ready() and time.monotonic() < deadline:
             time.sleep(POLL_S)
@@ -86,7 +76,7 @@ class PublishedPlace:
         node.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
 
     def over(self, start_ns: int, end_ns: int) -> Contact:
-        """See `ContactSource`."""
+        """The newest place, whatever the interval."""
         nan = float("nan")
         contact = contact_from_message(self._pose, nan, nan)
         return replace(contact, reason="the force is not measured (contact_source)")

@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
+from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll, answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.nodes.scan_time import ScanTime
@@ -84,10 +84,8 @@ class TipContact:
         self._tests = Goals(tester, "indent")
         for each in (client, tester):
             node.resources.callback(each.destroy)
-        self._retract = node.create_client(Trigger, "retract")
-        self._stop = node.create_client(SetBool, STOP)
-        for service in (self._retract, self._stop):
-            node.resources.callback(node.destroy_client, service)
+        self._retract = node.client_of(Trigger, "retract")
+        self._stop = node.client_of(SetBool, STOP)
 
     def listen(self) -> None:
         """Subscribe to contacts, for one scan; where the tip is now is unknown."""
@@ -256,20 +254,15 @@ class TipContact:
 
     def _ask_to_retract(self) -> bool:
         """Whether contact_node takes the request; states from before its answer do not count."""
-        if not self._retract.service_is_ready():
-            time.sleep(POLL_S)
+        answer = answer_of(
+            self._retract, Trigger.Request(), ASK_AGAIN_S, check=self._end_if_hung
+        )
+        if answer is None:
             return False
-        answer = self._retract.call_async(Trigger.Request())
-        deadline = time.monotonic() + ASK_AGAIN_S
-        while not answer.done():
-            if time.monotonic() > deadline:
-                self._retract.remove_pending_request(answer)
-                return False
-            time.sleep(POLL_S)
         self._state = None
-        if not answer.result().success:
+        if not answer.success:
             time.sleep(0.05)
-        return bool(answer.result().success)
+        return answer.success
 
     def _seen_within(self, wanted: str, seconds: float) -> bool:
         """Whether contact_node reports a state within a time; idle: that the tip is free."""

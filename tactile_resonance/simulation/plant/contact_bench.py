@@ -374,6 +374,6 @@ class ContactBench:
         self.arm = VirtualArm(self.clock)
         self.cell = VirtualCell(self.clock, cell_parameters, seed=seed)
         payload = Payload(tool_kg, vector(centre)) if on_tool else None
-        self.force = TipForce(self.cell, Mounting(mount, mounting.frame, payload), self.arm.state)
+        self.force = TipForce(self.cell, Mounting(mount, Pose.at_origin(), payload), self.arm.state)
         self.arm.connect()
         self.force.start()

@@ -18,15 +18,12 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import GRAVITY_M_S2
-from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import (
     Vector,
     cross,
     difference,
     rotated,
     rotated_back,
-    turn_from_vector,
-    turn_product,
     vector,
 )
 from tactile_resonance.fields import require
@@ -47,13 +44,11 @@ STANDING_M = 1e-5
 
 @dataclass(frozen=True)
 class CellMounting:
-    """Where the load cell sits and what else it carries.
+    """Where the load cell sits, its frame that of the tip or the base, and what else it carries.
 
     Attributes
     ----------
     mount : Mount
-    frame : Pose
-        Frame of the cell: in the frame `tip` on the tool, in the base under the sample.
     carried_kg : float
         Mass that the cell carries: tool beyond it, or the sample with its dish.
     centre_m : (3,) array
@@ -61,7 +56,6 @@ class CellMounting:
     """
 
     mount: Mount = Mount.TABLE
-    frame: Pose = field(default_factory=Pose.at_origin)
     carried_kg: float = 0.0
     centre_m: FloatArray = field(default_factory=lambda: np.zeros(3))
 
@@ -168,9 +162,7 @@ class Plant:
         self._held_n = ORIGIN  # force on what holds the tip: the beam's, where there is one
         self._turn = IDENTITY[0]  # of the tip
         self._stepped = False
-        cell = self.mounting
-        self._cell_m, self._carried_m = vector(cell.frame.position_m), vector(cell.centre_m)
-        self._cell_turn = turn_from_vector(vector(cell.frame.rotation_rad))
+        self._carried_m = vector(self.mounting.centre_m)
         self._gravity_m_s2 = vector(GRAVITY_M_S2)
         self._places: list[Vector] = []  # of the carried mass, newest last
         self._unloaded: tuple[Vector, Vector] | None = None  # what a cell that stands feels then
@@ -232,12 +224,11 @@ class Plant:
         gx, gy, gz = self._gravity_m_s2
         cx, cy, cz = self.torque_nm
         if self.mounting.mount is Mount.TABLE:
-            turn, origin, centre = self._cell_turn, self._cell_m, self._carried_m
+            turn, origin, centre = IDENTITY[0], ORIGIN, self._carried_m
             fx, fy, fz = self.force_n
             fx, fy, fz, cx, cy, cz = -fx, -fy, -fz, -cx, -cy, -cz
         else:
-            turn = turn_product(self._turn, self._cell_turn)
-            origin, centre = self._on_tip(self._cell_m), self._places[-1]
+            turn, origin, centre = self._turn, self.tip_m, self._places[-1]
             fx, fy, fz = self._held_n
             ax, ay, az = self._mass_acceleration()
             gx, gy, gz = gx - ax, gy - ay, gz - az

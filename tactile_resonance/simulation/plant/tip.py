@@ -56,6 +56,9 @@ class OnSoft(ABC):
         return ball
 
 
+BONE_PA, BONE_POISSON_RATIO = 10e6, 0.3
+
+
 class OnBone(OnSoft):
     """Soft tissue on an elastic half-space: both press on the ball, the lower from its depth on.
 
@@ -70,8 +73,6 @@ class OnBone(OnSoft):
         Its thickness [m].
     radius_m : float
         Of the ball.
-    modulus_pa, poisson_ratio : float
-        Of the bone.
     """
 
     def __init__(
@@ -80,13 +81,11 @@ class OnBone(OnSoft):
         *,
         layer_m: float,
         radius_m: float,
-        modulus_pa: float = 10e6,
-        poisson_ratio: float = 0.3,
     ) -> None:
         require(layer_m >= 0, "layer_m", layer_m, "0 or above")
         super().__init__(soft)
         self._layer_m = layer_m
-        self._c = 4 / 3 * modulus_pa / (1 - poisson_ratio**2) * math.sqrt(radius_m)
+        self._c = 4 / 3 * BONE_PA / (1 - BONE_POISSON_RATIO**2) * math.sqrt(radius_m)
 
     @property
     def force_n(self) -> float:
