@@ -12,7 +12,7 @@ import numpy as np
 
 from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.ur5e.machine import Environment, Machine, MachineConfig
-from tactile_resonance.simulation.ur5e.outputs import Outputs, OutputValue
+from tactile_resonance.simulation.ur5e.outputs import READERS, OutputValue
 from tactile_resonance.simulation.ur5e.poses import largest
 from tactile_resonance.simulation.ur5e.program import Program, register_offset
 from tactile_resonance.simulation.ur5e.registers import (
@@ -68,8 +68,6 @@ class UrController:
         False: an uploaded program is taken and never starts (a fault to be injected).
     popup : str or None
         Open on the pendant.
-    now : Outputs
-        RTDE outputs of this cycle.
     log : deque of str
         Newest lines of the controller's log, time stamped.
     """
@@ -95,7 +93,6 @@ class UrController:
         self.stood_still_s: float = 0.0
         self._cycles = 0
         self._refreshed_s = 0.0
-        self.now = Outputs(self)
 
     @property
     def time_s(self) -> float:
@@ -145,7 +142,10 @@ class UrController:
         KeyError
             Where the output is not known.
         """
-        return self.now.value(name)
+        if name not in READERS:
+            raise KeyError(f"RTDE output {name!r}: not known")
+        value = READERS[name](self)
+        return list(value) if isinstance(value, tuple) else value
 
     def start_program(self, text: str) -> None:
         """Run the client's control program, in place of one that runs.
@@ -208,7 +208,6 @@ class UrController:
             self._run_program()
         was_powered = self.safety.powered
         self.machine.step(was_powered)
-        self.now = Outputs(self)
         force = math.hypot(*self.machine.tcp_force[:3])
         if force > self.machine.config.limits.tool_force_n and self.safety.may_move:
             self.protective_stop(f"force of {force:.0f} N at the tool")

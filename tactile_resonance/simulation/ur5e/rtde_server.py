@@ -256,7 +256,7 @@ class _Service:
         assert recipe is not None
         data = known.get(recipe.names)
         if data is None:
-            values = [read(controller.now) for read in recipe.readers]
+            values = [read(controller) for read in recipe.readers]
             data = known[recipe.names] = recipe.layout.pack(1, values)
         self._newest = data
         if self.connection.send(data, droppable=True):

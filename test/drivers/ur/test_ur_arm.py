@@ -268,7 +268,7 @@ def test_python_of_the_page(robot, module_arm, tmp_path, capsys, monkeypatch):
         slept_ns[0] += round(seconds * 1e9)
         clock.wait_until(slept_ns[0])
         time_s = robot.order("state")["time_s"]
-        until(lambda: names["arm"]._read() or names["arm"]._states.newest.robot_time_s == time_s)
+        until(lambda: names["arm"].receive() or names["arm"]._states.newest.robot_time_s == time_s)
 
     here = SimpleNamespace(sleep=sleep)
     names, whole = {"own": own}, ur_arm.UrArm
