@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +129,8 @@ def nominal_of(runs: Sequence[RunContent]) -> NominalContact | None:
         If they differ, or a scene cannot be read.
     """
     found = [read_run_scene(run.path / "scene.yaml").nominal_contact for run in runs]
-    texts = [_as_text(nominal) for nominal in found]
+    # equal for equal ones
+    texts = [each and json.dumps(asdict(each), default=np.ndarray.tolist) for each in found]
     for run, text in zip(runs, texts, strict=True):
         accepted = f"that of {runs[0].path.name}; give one for all with --nominal FILE"
         require(text == texts[0], f"{run.path.name}: nominal_contact", text or "none", accepted)
@@ -238,12 +240,3 @@ def _preparation(label: Label, run: str) -> str:
 def _position(label: Label, result: PointResult) -> str:
     place = (f"{round(each / PLACE_M)}" for each in result.position_m[:2])
     return label.position or ", ".join(place)
-
-
-def _as_text(nominal: NominalContact | None) -> str:
-    """Equal for equal ones."""
-    if nominal is None:
-        return ""
-    values = {item.name: getattr(nominal, item.name) for item in fields(nominal)}
-    slope = values.pop("sensitivity")
-    return str([*values.items(), slope.per_n.tolist(), slope.covariance.tolist()])

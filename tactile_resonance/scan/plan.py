@@ -192,9 +192,11 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
     ValueError
         If no position lies on it.
     """
-    surface = _expected_surface(scene) if surface is None else surface
+    under = scene.surface if surface is None else surface
+    if isinstance(under, TouchRequest):
+        under = Plane((0.0, 0.0, under.expected_height_m))
     xy, given_z = scene.positions_m[:, :2], scene.positions_m[:, 2]
-    height, normals = surface.height_m(xy), surface.normal(xy)
+    height, normals = under.height_m(xy), under.normal(xy)
     z = np.where(np.isnan(given_z), height, given_z)
     off = np.isnan(z) | np.any(np.isnan(normals), axis=1)
     with np.errstate(invalid="ignore"):
@@ -206,7 +208,7 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
             "too steep; accepted is one usable position or more"
         )
     turns = tip_orientation(normals[kept], scene.sensor.heading_rad)
-    std = surface.height_std_m(xy[kept])
+    std = under.height_std_m(xy[kept])
     where = np.column_stack([xy[kept], z[kept]])
     plan = plan_points(scene, scan_points(scene.name, where, normals[kept], turns, std))
     each_s = CONTACT_S + plan.measurement.blocks.most * plan.measurement.block_s
@@ -219,13 +221,6 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
         if left.any()
     )
     return replace(plan, left_out=left_out)
-
-
-def _expected_surface(scene: ScanScene) -> Surface:
-    """That of a scene; level where it is still to be found."""
-    if isinstance(scene.surface, TouchRequest):
-        return Plane((0.0, 0.0, scene.surface.expected_height_m))
-    return scene.surface
 
 
 def _in_mm(point: ScanPoint) -> str:

@@ -200,7 +200,8 @@ def find_surface(
         height = _expected(touches, (x, y), request.expected_height_m, ball_radius_m)
         label = f"surface, touch {index + 1}"
         search_m = request.search_m if len(touches) < 3 else 0.0
-        heights = height + np.linspace(search_m, -search_m, _steps(search_m))
+        steps = 1 + math.ceil(2 * search_m / SEARCH_STEP_M)
+        heights = height + np.linspace(search_m, -search_m, steps)
         points = [ScanPoint(index, (x, y, z), UP, turn, label) for z in heights.tolist()]
         try:
             touches.append(_first_found(points, touch))
@@ -242,11 +243,6 @@ def _first_found(points: Sequence[ScanPoint], touch: Callable[[ScanPoint], Touch
         except SurfaceMissing:
             continue
     return touch(points[-1])
-
-
-def _steps(search_m: float) -> int:
-    """Heights at which a surface is searched for."""
-    return 1 + math.ceil(2 * search_m / SEARCH_STEP_M)
 
 
 def _expected(
