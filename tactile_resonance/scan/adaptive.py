@@ -34,7 +34,7 @@ from tactile_resonance.fields import (
 from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.points import Pair, Places, corners, grid, inside_polygon, on_a_line
+from tactile_resonance.scan.points import Pair, Places, corners, grid_within, on_a_line
 from tactile_resonance.tissue.classify import TissueClass
 
 MOST_PLACES = 2500
@@ -150,9 +150,7 @@ class Adaptive:
         ValueError
             If there are too few or too many.
         """
-        low, high = self.polygon_m.min(axis=0), self.polygon_m.max(axis=0)
-        whole = grid((low + high) / 2, high - low, (self.spacing_m,) * 2, "raster")
-        kept = whole[inside_polygon(whole, self.polygon_m)]
+        kept = grid_within(self.polygon_m, (self.spacing_m,) * 2, "raster")
         good = LEAST_POINTS <= len(kept) <= MOST_PLACES
         accepted = f"a spacing with {LEAST_POINTS} to {MOST_PLACES} places in the region"
         require(good, "spacing_m", f"{self.spacing_m:g}, {len(kept)} places", accepted)

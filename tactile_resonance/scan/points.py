@@ -131,6 +131,13 @@ def grid(
     return np.concatenate(rows)
 
 
+def grid_within(polygon_m: FloatArray, spacing_m: npt.ArrayLike, order: str) -> FloatArray:
+    """(n, 2) positions of the `grid` over a polygon of (k, 2) corners that lie in it [m]."""
+    low, high = polygon_m.min(axis=0), polygon_m.max(axis=0)
+    whole = grid((low + high) / 2, high - low, spacing_m, order)
+    return whole[inside_polygon(whole, polygon_m)]
+
+
 def spiral(center_m: npt.ArrayLike, radius_m: float, spacing_m: float) -> FloatArray:
     """(n, 2) positions of an Archimedean spiral from its centre outwards [m].
 
@@ -284,10 +291,7 @@ class _Region:
     order: Order = "serpentine"
 
     def positions(self) -> FloatArray:
-        polygon = corners(self.polygon_m)
-        low, high = polygon.min(axis=0), polygon.max(axis=0)
-        whole = grid((low + high) / 2, high - low, self.spacing_m, self.order)
-        kept = whole[inside_polygon(whole, polygon)]
+        kept = grid_within(corners(self.polygon_m), self.spacing_m, self.order)
         require(len(kept) > 0, "spacing_m", self.spacing_m, "fine enough for a point")
         return flat(kept)
 
