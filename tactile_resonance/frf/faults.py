@@ -123,8 +123,6 @@ def find_faults(
     *,
     sample_rate_hz: float,
     harmonics: npt.NDArray[np.integer],
-    u_range_v: tuple[float, float] | None = None,
-    y_range_v: tuple[float, float] | None = None,
     transient_removed: bool = False,
 ) -> FaultReport:
     """Look for acquisition faults in records.
@@ -135,8 +133,6 @@ def find_faults(
     sample_rate_hz : float
     harmonics : (F,) int
         Excited lines.
-    u_range_v, y_range_v : (low, high), optional
-        Ends of the range of each channel [V]. Without them, saturation shows only as a flat top.
     transient_removed : bool
         The FRF comes from a method that removes transients (local polynomial), or the first period
         is dropped: one that has not settled is then not reported, and a slow drift does no harm.
@@ -158,7 +154,7 @@ def find_faults(
     reports = []
     for index in range(len(samples)):
         faults: list[Fault] = []
-        for row, name, range_v in ((1, "actuator", u_range_v), (0, "sensor", y_range_v)):
+        for row, name in ((1, "actuator"), (0, "sensor")):
             of = (index, row)
             channel = _Channel(
                 name,
@@ -167,7 +163,6 @@ def find_faults(
                 by_period[of],
                 sample_rate_hz,
                 np.asarray(harmonics),
-                range_v,
                 transient_spoils=not transient_removed,
             )
             missing = missing_samples(channel)
@@ -206,7 +201,6 @@ class _Channel:
     by_period: ComplexArray
     sample_rate_hz: float
     harmonics: npt.NDArray[np.integer]
-    range_v: tuple[float, float] | None
     transient_spoils: bool
 
     @property
@@ -253,19 +247,12 @@ def missing_samples(x: _Channel) -> Fault | None:
 
 
 def saturation(x: _Channel) -> Fault | None:
-    """Samples at the ends of the range, or flat tops where the range is not known."""
+    """Flat tops."""
     record = x.samples.ravel()
-    if x.range_v is not None:
-        low, high = x.range_v
-        margin = 1e-6 * (high - low)
-        count = int(np.count_nonzero((record <= low + margin) | (record >= high - margin)))
-        where = f"at the ends of its range ({low:g} to {high:g} V)"
-    else:
-        count = sum(_clipped(sign * record, x.periods) for sign in (1, -1))
-        where = "on flat tops"
+    count = sum(_clipped(sign * record, x.periods) for sign in (1, -1))
     if count == 0:
         return None
-    text = f"The {x.name} is saturated: {count} samples {where}"
+    text = f"The {x.name} is saturated: {count} samples on flat tops"
     return x.fault(FaultKind.SATURATION, count, True, text)
 
 
