@@ -17,6 +17,7 @@ from tactile_resonance.fields import require
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.skew import linear_phase
 from tactile_resonance.frf.spectra import Spectrum
 
 SMOOTH_LINES = 41
@@ -127,14 +128,8 @@ def start_channel(loopback: Sequence[CalibrationRecord]) -> tuple[float, float]:
     if not loopback:
         return 1.0, 0.0
     frf = loopback[0].frf
-    f, g = frf.frequency_hz, frf.g
-    steps = np.diff(f)
-    near = steps < 1.5 * steps.min()
-    turn = np.angle(np.sum((g[1:] * g[:-1].conj())[near]))
-    coarse = -turn / (2 * np.pi * steps[near].mean())
-    straight = g * np.exp(2j * np.pi * f * coarse)
-    fine = -np.polyfit(f, np.unwrap(np.angle(straight)), 1)[0] / (2 * np.pi)
-    return float(np.abs(g).mean()), float(coarse + fine)
+    delay_s, *_ = linear_phase(frf.frequency_hz, frf.g)
+    return float(np.abs(frf.g).mean()), float(delay_s)
 
 
 def start_in_air(

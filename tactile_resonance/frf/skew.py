@@ -64,7 +64,7 @@ def skew_from_loopback(
     f = frf.frequency_hz
     if f.size < 3:
         raise ValueError(f"harmonics: {f.size} lines, expected at least 3 to fit a delay")
-    delay, intercept, residual, std = _linear_phase(f, frf.g)
+    delay, intercept, residual, std = linear_phase(f, frf.g)
     largest = float(np.max(np.abs(residual)))
     if largest > 0.5:
         raise ValueError(
@@ -106,7 +106,7 @@ def suspected_skew(frf: FRF) -> Fault | None:
     f, g = frf.frequency_hz[upper], frf.g[upper]
     if f.size < 8 or g.ndim != 1:
         return None
-    delay, intercept, residual, std = _linear_phase(f, g)
+    delay, intercept, residual, std = linear_phase(f, g)
     turned = abs(2 * np.pi * delay * f[-1])
     # against what it turns over the lines: near a mode it turns too, but along no straight line
     turned_over_lines = abs(2 * np.pi * delay * (f[-1] - f[0]))
@@ -122,7 +122,7 @@ def suspected_skew(frf: FRF) -> Fault | None:
     return Fault(FaultKind.CHANNEL_SKEW, "both", abs(float(delay)), False, text)
 
 
-def _linear_phase(
+def linear_phase(
     f: FloatArray, g: ComplexArray
 ) -> tuple[np.floating, np.floating, FloatArray, np.floating]:
     """Delay, phase at zero frequency, residual phases (F,), and standard deviation of the delay."""
