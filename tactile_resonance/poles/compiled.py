@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -56,27 +56,40 @@ def _plain(array: npt.NDArray) -> npt.NDArray:
     return array if flags.c_contiguous and flags.writeable else np.array(array, order="C")
 
 
-REHEARSALS: list[Callable[[], object]] = []
+def rehearse() -> None:
+    """One fit of each kind, to little data."""
+    from tactile_resonance.frf.result import FRF
+    from tactile_resonance.poles.identify import identify_batch
+    from tactile_resonance.poles.joint import JointPlan, PoleEstimator
+    from tactile_resonance.poles.noise_level import log_linear, two_channels
+    from tactile_resonance.poles.structure import ModelStructure
+
+    frequency_hz, rng = np.arange(65) / 128, np.random.default_rng(0)
+    s = 2j * np.pi * frequency_hz
+    g = np.asarray(1 / (s**2 + 0.1 * s + 2), complex)
+    u = rng.standard_normal((2, 128))
+    y = np.fft.irfft(g * np.fft.rfft(u)) + 1e-3 * rng.standard_normal(u.shape)
+    u, y = u.reshape(2, 2, 64), y.reshape(2, 2, 64)
+    kind = (1.0, 64, 2, np.arange(8, 25), (0.1, 0.4), ModelStructure(2, 2))
+    JointPlan(*kind)(u[0], y[0])
+    PoleEstimator(*kind)(u, y)
+    identify_batch(FRF(frequency_hz, g, np.ones(65), noise_dof=2), None, ModelStructure(2, 2))
+    two_channels(np.ones((1, 3)), np.ones((1, 3)))  # where noise is neither flat nor sloped
+    log_linear(np.ones((1, 3)))
 
 
-def rehearsal(call: Callable[[], object]) -> Callable[[], object]:
-    """Mark a function that calls the compiled functions of its module, each once, on a little data."""
-    REHEARSALS.append(call)
-    return call
+_begun: list[bool] = []
 
 
-@cache
 def compiled() -> int:
     """How many functions were not in the cache and had to be compiled, of those that fits call.
 
     About a minute of work, once per installation, which the log says before it begins.
     """
-    import tactile_resonance.poles.identify
-    import tactile_resonance.poles.joint  # noqa: F401 - with all that these use
-
-    with event.install_listener("numba:compile", _Notice()):
-        for call in REHEARSALS:
-            call()
+    if not _begun:
+        _begun.append(True)  # before, for what is rehearsed asks as well
+        with event.install_listener("numba:compile", _Notice()):
+            rehearse()
     return sum(sum(kernel.stats.cache_misses.values()) for kernel in KERNELS)
 
 

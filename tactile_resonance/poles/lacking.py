@@ -17,7 +17,7 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
-from tactile_resonance.poles.compiled import entry, inner, rehearsal
+from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.whiteness import are_smooth
 
@@ -256,11 +256,3 @@ def _fall(pair, own, slope, power, inverse, crossed):
     if not determinant > LEAST_LEFT * p_00 * p_11:
         return 0.0
     return (left_11 * s_0 * s_0 - 2 * left_01 * s_0 * s_1 + left_00 * s_1 * s_1) / determinant
-
-
-@rehearsal
-def _search_a_little() -> None:
-    one, none = np.ones((1, 1)), np.empty((1, 0))
-    data = BinData.of(one[None], one[None])
-    bases = (np.ones((1, 2), complex), one + 0j, none + 0j)
-    _falls(data, bases, np.ones((1, 2)), np.ones((1, 2, 2)), np.ones((1, 2), complex), np.ones((1, 2, 2, 1)))

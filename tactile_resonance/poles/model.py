@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
-from tactile_resonance.poles.compiled import entry, rehearsal
+from tactile_resonance.poles.compiled import entry
 from tactile_resonance.poles.structure import ModelStructure
 
 
@@ -187,11 +187,6 @@ def _residues_and_sensitivity(x, ds_dx, denominator, numerator, hessenberg_a, he
             residues[point, k] = above * factor
     return residues, sensitivity
 
-
-@rehearsal
-def _find_a_residue() -> None:
-    one, two = np.ones((1, 1)), np.ones((1, 2))
-    _residues_and_sensitivity(one + 0j, one + 0j, two, two, two.T, two.T)
 
 
 def _dot(basis: ComplexArray, coefficients: FloatArray) -> ComplexArray:

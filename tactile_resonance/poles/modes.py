@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.compiled import entry, rehearsal
+from tactile_resonance.poles.compiled import entry
 from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.result import natural_frequency_and_damping
 
@@ -153,13 +153,6 @@ def _propagated(poles, sensitivity, parameters):
             in_f0[point, k, 0, 1] = in_f0[point, k, 1, 0] = both
     return of_poles, in_f0
 
-
-@rehearsal
-def _propagate_a_little() -> None:
-    one = np.ones((1, 1))
-    _propagated(one + 0j, one[..., None] + 0j, one[..., None])
-    _in_band(one + 0j, 0.0, 1.0)
-    two_roots(np.ones((1, 3)), np.ones((3, 2)))
 
 
 def pole_quantities(

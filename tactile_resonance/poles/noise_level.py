@@ -15,7 +15,7 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
-from tactile_resonance.poles.compiled import entry, inner, rehearsal
+from tactile_resonance.poles.compiled import entry, inner
 
 # Bartlett's test rejects a flat variance wrongly in one of ten thousand bands.
 FALSE_ALARM = 1e-4
@@ -324,12 +324,6 @@ def log_linear(variance):
         _fit_slope(variance[point], usable, model[point])
     return model
 
-
-@rehearsal
-def _model_a_little() -> None:
-    model_variance(np.ones((1, 3)), 2)
-    two_channels(np.ones((1, 3)), np.ones((1, 3)))
-    log_linear(np.ones((1, 3)))
 
 
 def are_flat(variance: FloatArray, dof: int) -> BoolArray:

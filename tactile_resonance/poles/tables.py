@@ -11,9 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles import likelihood
-from tactile_resonance.poles.compiled import compiled, rehearsal
-from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.compiled import compiled
 from tactile_resonance.poles.likelihood import (
     BLOCK,
     ROW_A,
@@ -206,11 +204,6 @@ class Problem:
     numerator: ComplexArray
     transient: ComplexArray
 
-    @classmethod
-    def of_lines(cls, denominator: ComplexArray, numerator: ComplexArray) -> Problem:
-        """Driven bins without transient."""
-        return cls(denominator, numerator, np.empty((denominator.shape[0], 0), complex))
-
     @property
     def sizes(self) -> tuple[int, int, int]:
         """Numbers of free coefficients of A, B and C."""
@@ -242,18 +235,3 @@ class Problem:
         """(batch, K_driven) B / A of coefficients (batch, n)."""
         alpha, beta, _ = self.split(theta)
         return np.asarray(beta @ self.numerator.T / (alpha @ self.denominator[self.undriven :].T))
-
-
-@rehearsal
-def _fit_a_little() -> None:
-    bins, undriven = 4 * BLOCK, 3 * BLOCK
-    s = 1j * np.linspace(0.8, 1.2, bins)
-    one = np.ones((bins, 1), complex)
-    tables = Tables.of(np.stack([one[:, 0], s, s**2 + 0.5], axis=-1), one[undriven:], one)
-    rng = np.random.default_rng(0)
-    u = rng.standard_normal((1, 1, bins, 2)).view(complex)[..., 0]
-    data = BinData.of(u / (s**2 + 0.04 * s + 1), u, np.arange(bins), undriven)
-    rules = likelihood.Rules(2, 1e-2, 1e-14, 3, BLOCK, 1.0, 1.0)
-    theta, *_ = likelihood.minimise(tables, data, np.empty((0, 1, 4)), rules)
-    _, _, normal = likelihood.moments(tables, data, theta)
-    likelihood.invert(normal[:, 0, 1])

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.compiled import entry, rehearsal
+from tactile_resonance.poles.compiled import entry
 
 # Residuals of noise alone are smoother than this once in a thousand fits.
 SMOOTH_RESIDUAL = 3.09
@@ -127,8 +127,3 @@ def _scores(residual, counts, cosines):
             best = score if not score <= best else best  # not a number where the first one is none
         scores[point] = best
     return scores
-
-
-@rehearsal
-def _score_a_little() -> None:
-    _scores(np.ones((1, 3), complex), *components(3, 1))
