@@ -158,7 +158,8 @@ class _Round:
         noise = None
         if self.share is not None and self.data.undriven:
             noise = self.normal_of_excited(self.share)
-        return self.levels.covariances(suspect, noise)
+        shared = sum(self.plan.problem.sizes[:2])
+        return self.levels.covariances(self.solution, shared, suspect, noise)
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -367,7 +368,7 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
         covariance=covariance,
         total=total,
         kind=fitted.kind,
-        noise_variance=fitted.noise * levels.noise_level(suspect)[:, None],
+        noise_variance=fitted.noise * levels.noise_level(suspect)[0][:, None],
         systematic=systematic_of(plan, fitted.data, theta, suspect),
     )
     return _each_by_itself(judged, total, first)

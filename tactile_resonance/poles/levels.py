@@ -180,9 +180,6 @@ class Levels:
     ----------
     common : (batch, K_e) complex
         Of weighted residuals; see `common_and_differing`.
-    solution : Solution
-    shared : int
-        Coefficients that realisations share.
     between : (batch,) float
         From the bins between harmonics: noise; NaN where there are none.
     between_dof : (batch,) float
@@ -208,8 +205,6 @@ class Levels:
     """
 
     common: ComplexArray
-    solution: Solution
-    shared: int
     between: FloatArray
     between_dof: FloatArray
     excited: FloatArray
@@ -245,8 +240,6 @@ class Levels:
         by_piece : (batch,) bool
             Where that variance is from each of the pieces alone.
         """
-        a, b, _ = plan.problem.sizes
-        shared = a + b
         batch, records, lines = solution.residual.shape
         common, differing = common_and_differing(solution.residual, u)
         common_cost = np.sum(common.real**2 + common.imag**2, axis=-1)
@@ -273,8 +266,6 @@ class Levels:
             chance = np.where(by_piece, of_pieces, chance)
         return cls(
             common,
-            solution,
-            shared,
             between,
             between_dof,
             excited,
@@ -287,10 +278,10 @@ class Levels:
             np.where(by_piece, float(pieces.dof), 0.0),
         )
 
-    def distorted(self, chance: float = DISTORTION_PROBABILITY) -> BoolArray:
+    def distorted(self) -> BoolArray:
         """(batch,) whether realisations differ by more than the noise between harmonics explains."""
-        ratio = self.excited / self.between
-        return np.asarray(special.fdtrc(2 * self.excited_dof, 2 * self.between_dof, ratio) < chance)
+        chance = special.fdtrc(2 * self.excited_dof, 2 * self.between_dof, self.excited / self.between)
+        return np.asarray(chance < DISTORTION_PROBABILITY)
 
     def _residual_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(batch,) level of the excited lines and its degrees of freedom.
@@ -303,11 +294,8 @@ class Levels:
         cost = self.excited * self.excited_dof + np.where(alone, 0.0, common_cost)
         return cost / dof, dof
 
-    def noise_level(self, suspect: BoolArray) -> FloatArray:
-        """(batch,) of the noise; without bins between harmonics of noise and distortion."""
-        return self._noise_level(suspect)[0]
-
-    def _noise_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def noise_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """(batch,) of the noise, and its dof; without bins between harmonics of noise and distortion."""
         level, dof = self._residual_level(suspect)
         if np.isnan(self.between_dof).all():
             return level, dof
@@ -317,12 +305,15 @@ class Levels:
         return np.where(apart, self.between, pooled), np.where(apart, self.between_dof, both)
 
     def covariances(
-        self, suspect: BoolArray, noise_normal: FloatArray | None
+        self, solution: Solution, shared: int, suspect: BoolArray, noise_normal: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
         """Covariances (batch, s, s) of the shared coefficients, from noise and in total.
 
         Parameters
         ----------
+        solution : Solution
+        shared : int
+            How many coefficients realisations share.
         suspect : (batch,) bool
             Where the model is in error.
         noise_normal : (batch, M, n, n) float or None
@@ -330,19 +321,17 @@ class Levels:
             all they were weighted with.
         """
         level, dof = self._residual_level(suspect)
-        between, between_dof = self._noise_level(suspect)
+        between, between_dof = self.noise_level(suspect)
         with np.errstate(divide="ignore", invalid="ignore"):
             nu = self.piece_dof
             pieces = np.where(nu > 2, nu / (nu - 2), 1.0)
-            solution, shared = self.solution, self.shared
             first, last = solution.normal[:, :, 0], solution.normal[:, :, 1]
             noise = solution.marginal[:, 0, :shared, :shared]
             if np.isnan(self.between_dof).all():
                 both = 0.5 * (level * student_variance(dof) * pieces)[:, None, None]
                 return both * noise, both * noise
             if noise_normal is not None:
-                between = self.between
-                between_dof = self.between_dof
+                between, between_dof = self.between, self.between_dof
                 noise = solution.sandwich(first + noise_normal, shared)
             more = level / between
             if noise_normal is None:  # there is no less than the noise
