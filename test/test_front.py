@@ -210,7 +210,7 @@ def test_a_band_without_lines_is_refused_for_recording_and_response_alike(record
             "frequency_hz: got 'f'; accepted is an array",
         ),
         (lambda r: tr.ModelStructure(delay=np.nan), "delay: got nan; accepted is true or false"),
-        (lambda r: tr.PoleEstimator("x", 9, 3, [4], (1, 2)), "sample_rate_hz: 'x', expected"),
+        (lambda r: tr.PoleEstimator("x", 9, 3, [4], (1, 2)), "sample_rate_hz: got 'x'; accepted is a"),
         (lambda r: tr.PoleEstimator(5e3, 9, 3, [2.5], (1, 2)), "harmonics: .*2.5.*expected whole"),
         (lambda r: tr.design_multisine(sample_rate_hz="1"), "sample_rate_hz: got '1'; accepted"),
         (lambda r: tr.design_multisine(samples_per_period=9.5), "samples_per_period: got 9.5; acc"),

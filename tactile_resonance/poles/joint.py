@@ -16,12 +16,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from numbers import Integral, Real
+from numbers import Integral
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.basis import (
     PolynomialBasis,
@@ -321,34 +322,22 @@ class JointPlan(FitPlan):
         return ~self.driven
 
     def _check(self) -> None:
-        for name, least in (("samples_per_period", 1), ("periods", 1), ("transient_terms", 1)):
+        for name in ("samples_per_period", "periods", "transient_terms"):
             value = getattr(self, name)
-            if name == "transient_terms" and value is None:
-                continue
-            if not (isinstance(value, Integral) and int(value) >= least):
-                raise ValueError(f"{name}: {value!r}, expected a whole number, at least {least}")
-        rate_hz = _number(self.sample_rate_hz)
-        if not 0 < rate_hz < np.inf:
-            raise ValueError(f"sample_rate_hz: {self.sample_rate_hz!r}, expected above 0, finite")
-        try:
-            low, high = (_number(edge) for edge in self.band_hz)
-        except (TypeError, ValueError):
-            low = high = np.nan
-        if not 0 <= low < high <= rate_hz / 2 * (1 + 1e-9):
-            raise ValueError(
-                f"band_hz: {self.band_hz!r}, expected (low, high) with 0 <= low < high <= "
-                f"{rate_hz / 2:g} Hz, half the sample rate"
-            )
-        if not isinstance(self.structure, ModelStructure):
-            raise ValueError(f"structure: {self.structure!r}, expected a ModelStructure")
-        if self.structure.domain == "z" and self.structure.sample_rate_hz != rate_hz:
-            raise ValueError(
-                f"structure.sample_rate_hz: {self.structure.sample_rate_hz:g}, expected that of "
-                f"the record, {rate_hz:g} Hz"
-            )
-        ratio = self.input_noise_ratio
-        if ratio is not None and not 0 <= _number(ratio) < np.inf:
-            raise ValueError(f"input_noise_ratio: {ratio!r}, expected 0 or above, finite")
+            if not (name == "transient_terms" and value is None):
+                good = isinstance(value, Integral) and int(value) >= 1
+                require(good, name, value, "a whole number, at least 1")
+        rate_hz = number(self.sample_rate_hz, "sample_rate_hz")
+        require(rate_hz > 0, "sample_rate_hz", rate_hz, "a number above 0")
+        band(self.band_hz, most_hz=rate_hz / 2)
+        require_kind(self.structure, "structure", ModelStructure)
+        if self.structure.domain == "z":
+            of_model = self.structure.sample_rate_hz
+            accepted = f"that of the record, {rate_hz:g} Hz"
+            require(of_model == rate_hz, "structure.sample_rate_hz", of_model, accepted)
+        if self.input_noise_ratio is not None:
+            ratio = number(self.input_noise_ratio, "input_noise_ratio")
+            require(ratio >= 0, "input_noise_ratio", ratio, "a number, 0 or above")
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,11 +404,6 @@ class PoleEstimator(JointPlan):
     @property
     def _between(self) -> BoolArray:
         return np.asarray(~self.driven & (self.bins % self.periods != 0))
-
-
-def _number(value: object) -> float:
-    """NaN where it is none."""
-    return float(value) if isinstance(value, Real) else float("nan")
 
 
 def whole_harmonics(harmonics: npt.ArrayLike) -> IntArray:
