@@ -23,8 +23,8 @@ from benchmarks.cubic_resonator import (
 )
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.multisine import design_multisine
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.poles.result import (
     Poles,
     PolesBatch,

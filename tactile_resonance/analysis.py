@@ -20,9 +20,7 @@ from tactile_resonance.frf.faults import find_faults
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.poles.estimator import POLES_METHODS, choose_among, second_attempt
-from tactile_resonance.poles.identify import identify_frf
-from tactile_resonance.poles.joint_records import identify_poles_from_bins
+from tactile_resonance.poles.estimator import POLES_METHODS, choose_among, poles_of_frf
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
 from tactile_resonance.recording.recording import Recording
@@ -147,20 +145,15 @@ def analyse(
         warnings.append(
             f"band: chosen around the strongest resonance, {band_hz[0]:g}-{band_hz[1]:g} Hz"
         )
-    if poles_method == "auto":
-        poles_method = "frf" if channel_delay_s else "joint"
-
     bins = None
-    if poles_method == "joint":
+    if poles_method != "frf" and not channel_delay_s:
         bins = band_bins(record, harmonics, sample_rate_hz=rate_hz, band_hz=band_hz)
     # faults of the FRF are reported once, below
-    silent = replace(faults.marked(frf), message="")
+    silent = replace(faults.marked(frf), message="", bins=bins)
+    method = "auto" if bins is None else poles_method
 
     def fit(structure: ModelStructure) -> Poles:
-        if bins is None:
-            return identify_frf(silent, band_hz, structure)
-        poles = identify_poles_from_bins(bins, band_hz, structure)
-        return second_attempt(poles, silent, band_hz, structure)
+        return poles_of_frf(silent, band_hz, structure, method)
 
     poles = choose_among(fit, candidates).best if candidates else fit(structure)
     identified = time.perf_counter()

@@ -13,7 +13,7 @@ from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.force_spread import joined_spread
 from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
 from tactile_resonance.frf.distortion import DETECTING, band_lines, distortion_in_band
-from tactile_resonance.frf.estimate import fast_frf, mean_spectra, robust_frf
+from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
 from tactile_resonance.frf.faults import Fault, FaultKind, FaultReport, find_faults
 from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus
 from tactile_resonance.frf.skew import correct_skew
@@ -223,10 +223,7 @@ class MeasurementFrf:
         if periods < max(self._periods.values()):
             return  # it counts once it is as long as the others
         each = [of for of, _ in self._spectra.values()]
-        if len(each) == 1:
-            frf = fast_frf(spectra, sample_rate_hz=excitation.sample_rate_hz)
-        else:
-            frf = robust_frf(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
+        frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
         stacked = [
             stacked_bins(of) for of in zip(*(of for _, of in self._spectra.values()), strict=True)
         ]

@@ -26,6 +26,7 @@ from tactile_resonance.poles.fit import Linearised
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.joint_fit import ROUNDED
 from tactile_resonance.poles.joint_noise import rough_noise, with_noise
+from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.modes import propagated
 from tactile_resonance.poles.result import (
@@ -34,7 +35,6 @@ from tactile_resonance.poles.result import (
     PolesStatus,
     natural_frequency_and_damping_jacobian,
 )
-from tactile_resonance.poles.single_point import single
 
 # How often a constant mode is found to change.
 FALSE_ALARM = 2e-5

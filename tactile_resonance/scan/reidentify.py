@@ -24,8 +24,8 @@ import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.fields import read_dataclass, read_yaml, section
+from tactile_resonance.poles.estimator import identify_poles_from_bins
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.joint_records import identify_poles_from_bins
 from tactile_resonance.poles.result import STATUSES, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.kept_bins import (

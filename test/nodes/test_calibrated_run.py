@@ -23,7 +23,7 @@ from tactile_resonance.nodes.messages import (
     poles_to_message,
     record_to_message,
 )
-from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_result import POLES_TYPE, PointKind, PointResult

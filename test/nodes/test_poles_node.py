@@ -23,7 +23,7 @@ from tactile_resonance.nodes.messages import (
 )
 from tactile_resonance.nodes.poles_node import PolesNode
 from tactile_resonance.nodes.running import initialised
-from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Channel, Origin, Record
 

@@ -4,7 +4,7 @@
 import numpy as np
 
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)

@@ -11,7 +11,7 @@ from tactile_resonance.analysis import analyse
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles import estimator
-from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording
@@ -104,7 +104,7 @@ def test_realisations_with_a_disturbance():
 def test_a_joint_fit_that_does_not_converge_is_followed_by_the_frf(monkeypatch):
     u, y = record(1, kind="white", periods=4)
     monkeypatch.setattr(
-        "tactile_resonance.analysis.identify_poles_from_bins",
+        "tactile_resonance.poles.estimator.identify_poles_from_bins",
         lambda *arguments, **options: Poles(status=PolesStatus.NOT_CONVERGED),
     )
     poles = analyse(Recording(u[None], y[None], RATE_HZ, ODD), band_hz=BAND_HZ).poles

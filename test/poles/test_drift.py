@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 from scipy import stats
 
-from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 

@@ -8,8 +8,8 @@ import pytest
 
 from benchmarks.poles_plant import HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
+from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.result import PolesStatus
-from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
 
 STRUCTURES = [ModelStructure(), ModelStructure(2, 2), ModelStructure(1, 1), ModelStructure(4, 9)]

@@ -19,16 +19,17 @@ from poles.mode_at_250_hz import (
 
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.poles.estimator import choose_among, poles_of_frf
+from tactile_resonance.poles.estimator import (
+    choose_among,
+    identify_poles_from_bins,
+    poles_of_frf,
+)
 from tactile_resonance.poles.identify import (
     identify_batch,
     identify_frf,
     identify_spectra,
 )
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.joint_records import (
-    identify_poles_from_bins,
-)
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 

@@ -15,8 +15,8 @@ from benchmarks.poles_plant import (
     Plant,
     judge,
 )
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 

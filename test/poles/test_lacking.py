@@ -14,10 +14,10 @@ from benchmarks.poles_plant import (
 )
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.lacking import lacking_terms
 from tactile_resonance.poles.likelihood import invert, moments
 from tactile_resonance.poles.result import PolesStatus
-from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)

@@ -15,9 +15,9 @@ from benchmarks.poles_plant import (
     Plant,
 )
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.poles.model_error import correlation_length, model_error_factor
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure

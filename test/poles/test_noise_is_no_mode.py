@@ -19,9 +19,9 @@ from scipy import stats
 
 from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.modes import squared_distance
 from tactile_resonance.poles.result import PolesStatus
-from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
 
 RUNS = 400

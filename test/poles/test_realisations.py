@@ -19,10 +19,10 @@ from benchmarks.poles_plant import (
     bound_of_realisations,
     judge,
 )
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.result import PolesStatus
-from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)

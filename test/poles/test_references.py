@@ -11,12 +11,12 @@ from scipy import stats
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.identify import (
     identify_batch,
     identify_frf,
     identify_spectra,
 )
-from tactile_resonance.poles.joint_records import identify_poles_from_records
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.whiteness import SMOOTH_RESIDUAL

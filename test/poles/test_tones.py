@@ -18,8 +18,8 @@ from benchmarks.poles_plant import (
 )
 from tactile_resonance.frf.band_bins import BandBins
 from tactile_resonance.multisine import mains_lines
+from tactile_resonance.poles.estimator import identify_poles_from_bins
 from tactile_resonance.poles.identify import identify_frf
-from tactile_resonance.poles.joint_records import identify_poles_from_bins
 from tactile_resonance.poles.result import PolesStatus
 
 SPACING_HZ = SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD

@@ -26,8 +26,8 @@ from tactile_resonance.poles.identify import (
     identify_frf,
     identify_spectra,
 )
+from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.result import PolesStatus
-from tactile_resonance.poles.single_point import single
 from tactile_resonance.poles.structure import ModelStructure
 
 

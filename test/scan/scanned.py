@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.poles.joint_records import identify_poles_from_records
+from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.decision import decide_mode
 from tactile_resonance.scan.hands import Measured
