@@ -9,7 +9,7 @@ fit is tested (`outliers`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import special
@@ -80,7 +80,10 @@ def _leaving_out(plan: JointPlan, bins: tuple[int, ...]) -> JointPlan:
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """A fit without the tones taken, and the data that it saw, (M, K) without what leaks out of these."""
+    """A fit without the tones taken; the data that it saw, (M, K) without what leaks out of these.
+
+    And what it makes of all bins of the band, those left out too.
+    """
 
     plan: JointPlan
     batch: PolesBatch
@@ -100,6 +103,50 @@ class _Fitted:
             rest[tone.channel] = rest[tone.channel] - tone.leak(plan)
         u, y = rest["actuator"], rest["sensor"]
         return cls(plan, plan.from_bins(u.reshape(shape), y.reshape(shape)), u, y)
+
+    @cached_property
+    def _denominator(self) -> ComplexArray:
+        """(K,)."""
+        return np.asarray(self.plan.denominator_basis.values @ self.batch.fit.denominator)
+
+    @cached_property
+    def g(self) -> ComplexArray:
+        """(K,) response."""
+        return np.asarray(self.plan.numerator_on_bins @ self.batch.fit.numerator / self._denominator)
+
+    @cached_property
+    def _output(self) -> ComplexArray:
+        """(M, K)."""
+        plan, basis = self.plan, self.plan.transient_on_bins
+        decay = self.batch.fit.transient.reshape(-1, basis.shape[1])  # (M, c)
+        transient = decay @ basis.T / self._denominator
+        # between harmonics the input is noise of the voltmeter, unless the output follows it
+        error, through = self.y - transient, self.g * self.u
+        less = np.linalg.norm((error - through)[:, plan.others_at])
+        follows = plan.driven | bool(less < np.linalg.norm(error[:, plan.others_at]))
+        return np.asarray(np.where(follows, through, 0) + transient)
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """(K,) of the output less that of the model."""
+        variance_y, variance_u = self.batch.noise_variance
+        return np.asarray(variance_y + np.where(self.plan.driven, variance_u * np.abs(self.g) ** 2, 0))
+
+    def errors(self) -> ComplexArray:
+        """(M, K) output less that of the model."""
+        return np.asarray(self.y - self._output)
+
+    def without_each(self) -> FloatArray:
+        """(K,) mean over records of what the cost falls by without a bin, in units of its variance.
+
+        0 where a bin is not used.
+        """
+        plan, weight = self.plan, np.zeros(self.plan.bins.size)
+        weight[plan.order] = 1 / np.sqrt(self.variance[plan.order])
+        u = np.where(plan.driven, self.u, 0)
+        bases = (plan.denominator_basis.values, plan.numerator_on_bins, plan.transient_on_bins)
+        scale, error = weight / self._denominator, self.errors() * weight
+        return np.asarray(falls_without_each(bases, self._output, u, scale, error).mean(axis=0))
 
 
 def poles_without_tones(
@@ -168,7 +215,7 @@ def _taken_too(
     fitted = _Fitted.without(plan, u, y, [*taken, tone])
     for _ in range(MOST_RETURNS):
         here = fitted.plan
-        rest = fitted.u if channel == "actuator" else _Model(fitted).errors()
+        rest = fitted.u if channel == "actuator" else fitted.errors()
         unknown = here.bins[here.driven] if channel == "actuator" else here.excited_bins
         at, phasor = _tone_near(here, rest + tone.leak(here), k, unknown)
         near = here.bins[np.abs(here.bins - at) <= NEAR_BINS]
@@ -188,66 +235,21 @@ def _lines_in_a_row(plan: JointPlan) -> bool:
     return bool(np.any(np.diff(gone) == 1))
 
 
-class _Model:
-    """What a fit makes of all bins of the band, those left out too.
-
-    Attributes
-    ----------
-    excited, others : (K,) bool
-        Bins that the fit has used.
-    """
-
-    def __init__(self, fitted: _Fitted) -> None:
-        plan, fit = fitted.plan, fitted.batch.fit
-        self._u, self._y, self.bins = fitted.u, fitted.y, plan.bins
-        self._p = plan.denominator_basis.values  # (K, a + 1)
-        self._q = plan.numerator_on_bins  # (K, b)
-        self._t = plan.transient_on_bins  # (K, c)
-        self._a = self._p @ fit.denominator  # (K,)
-        self.g = (self._q @ fit.numerator) / self._a
-        decay = fit.transient.reshape(-1, self._t.shape[1])  # (M, c)
-        self._transient = decay @ self._t.T / self._a  # (M, K)
-        self.driven = plan.driven
-        self.excited, self.others = np.zeros((2, plan.bins.size), bool)
-        self.excited[plan.excited_at] = self.others[plan.others_at] = True
-        # between harmonics the input is noise of the voltmeter, unless the output follows it
-        error, through = self._y - self._transient, self.g * self._u
-        less = np.linalg.norm((error - through)[:, self.others])
-        follows = self.driven | bool(less < np.linalg.norm(error[:, self.others]))
-        self._output = np.where(follows, through, 0) + self._transient  # (M, K)
-        variance_y, variance_u = fitted.batch.noise_variance
-        of_input = np.where(self.driven, variance_u * np.abs(self.g) ** 2, 0)
-        self.variance = np.asarray(variance_y + of_input)  # (K,)
-
-    def errors(self) -> ComplexArray:
-        """(M, K) output less that of the model."""
-        return np.asarray(self._y - self._output)
-
-    def without_each(self) -> FloatArray:
-        """(K,) mean over records of what the cost falls by without a bin, in units of its variance.
-
-        0 where a bin is not used.
-        """
-        weight = (self.excited | self.others) / np.sqrt(self.variance)
-        u, bases = np.where(self.driven, self._u, 0), (self._p, self._q, self._t)
-        falls = falls_without_each(bases, self._output, u, weight / self._a, self.errors() * weight)
-        return np.asarray(falls.mean(axis=0))
-
-
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
     """Bin and channel of what stands out most, if noise would not make it."""
-    plan, model = fitted.plan, _Model(fitted)
-    if not (np.isfinite(model.variance).all() and np.isfinite(model.g).all()):
+    plan = fitted.plan
+    if not (np.isfinite(fitted.variance).all() and np.isfinite(fitted.g).all()):
         return None
     rounding_y, rounding_u = (
-        ROUNDING * np.mean(np.abs(x[:, model.driven]) ** 2) for x in (fitted.y, fitted.u)
+        ROUNDING * np.mean(np.abs(x[:, plan.driven]) ** 2) for x in (fitted.y, fitted.u)
     )
-    on_line = plan.bins % plan.periods == 0
-    silent, odd = model.others & on_line, plan.bins // plan.periods % 2 == 1
-    kinds = [model.excited, silent & ~odd, silent & odd, model.others & ~on_line]
+    on_line, odd = plan.bins % plan.periods == 0, plan.bins // plan.periods % 2 == 1
+    excited, others = (np.isin(np.arange(odd.size), at) for at in (plan.excited_at, plan.others_at))
+    silent = others & on_line
+    kinds = [excited, silent & ~odd, silent & odd, others & ~on_line]
     input_power = np.mean(np.abs(fitted.u) ** 2, axis=0)
-    falls, least = model.without_each(), rounding_y / model.variance
+    falls, least = fitted.without_each(), rounding_y / fitted.variance
     if not plan.level_known:  # noise of the input may make more at a resonance
         least = np.maximum(least, 1.4 * median_filter(falls, 5))
     other = [np.zeros_like(on_line), *kinds[1:]]
@@ -255,7 +257,7 @@ def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
         "sensor": chances_of(falls, kinds, len(fitted.y), least),
         "actuator": chances_of(input_power, other, len(fitted.u), rounding_u),
     }
-    tests = np.count_nonzero(model.excited) + 2 * np.count_nonzero(model.others)
+    tests = plan.excited_at.size + 2 * plan.others_at.size
     channel = min(chances, key=lambda name: chances[name].min())
     k = int(np.argmin(chances[channel]))
     striking = chances[channel][k] * tests < FALSE_ALARM
@@ -299,21 +301,20 @@ def _stands_alone(fitted: _Fitted, tone: _Taken) -> bool:
 
     Around are bins between lines, and lines where the tone is on one.
     """
-    plan, model = fitted.plan, _Model(fitted)
+    plan, variance = fitted.plan, fitted.variance
     power = np.sum(np.abs(tone.phasor) ** 2)
-    rest = fitted.u if tone.channel == "actuator" else model.errors()
+    rest = fitted.u if tone.channel == "actuator" else fitted.errors()
     away = np.abs(plan.bins - tone.at)
-    kinds = [(model.others, 4 * BINS_OF_A_TONE)]
+    kinds = [(plan.others_at, 4 * BINS_OF_A_TONE)]
     if tone.channel == "sensor" and tone.on_line_of(plan):
-        kinds.append((model.excited, 2 * LINES_AROUND))
-    for kind, count in kinds:
-        at = np.flatnonzero(kind)
+        kinds.append((plan.excited_at, 2 * LINES_AROUND))
+    for at, count in kinds:
         near = at[np.argsort(away[at])[:count]]
         if near.size < 2:
             continue
         left = np.abs(rest[:, near]) ** 2
         # as large as at the tone, were they noise of the model's variance
-        left = left / model.variance[near] * np.interp(tone.at, plan.bins, model.variance)
+        left = left / variance[near] * np.interp(tone.at, plan.bins, variance)
         ratio = power / np.sum(np.mean(left, axis=1))
         if special.fdtrc(2 * len(left), 2 * left.size, ratio) > PEAK_PASSES:
             return False
