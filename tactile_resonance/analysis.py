@@ -155,7 +155,7 @@ def analyse(
     def fit(structure: ModelStructure) -> Poles:
         return poles_of_frf(silent, band_hz, structure, method)
 
-    poles = choose_among(fit, candidates).best if candidates else fit(structure)
+    poles = choose_among(fit, candidates) if candidates else fit(structure)
     identified = time.perf_counter()
     distortion = None
     if with_distortion:

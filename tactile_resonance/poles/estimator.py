@@ -10,7 +10,7 @@ bins are excitation.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -109,7 +109,7 @@ def poles_of_bands(frf: FRF, bands: Sequence[PoleBand], method: str = "auto") ->
             return poles_of_frf(alone, band.ends_hz, structure, method)
 
         if band.order == 0 and frf.status is not FrfStatus.FAILED:
-            return choose_among(fit).best
+            return choose_among(fit)
         return fit(ModelStructure.with_residual(band.order or 2, band.residual_terms))
 
     first, *further = (of_band(k, band) for k, band in enumerate(bands))
@@ -374,42 +374,10 @@ CANDIDATES = tuple(ModelStructure.with_residual(n, r) for n in (2, 4, 6) for r i
 """One to three modes, with six to ten residual terms."""
 
 
-@dataclass(frozen=True)
-class OrderChoice:
-    """Candidates and the one to take.
-
-    Attributes
-    ----------
-    poles : tuple of Poles
-        Of each candidate, in the order given.
-    mdl : tuple of float
-        ``(cost / F) exp(n log(2 F) / (2 F - n - 2))`` of each: minimum description length, with the
-        correction for few lines. Infinite where there is no result.
-    chosen : int
-        Index of the smallest.
-    """
-
-    poles: tuple[Poles, ...]
-    mdl: tuple[float, ...]
-    chosen: int
-
-    @property
-    def best(self) -> Poles:
-        """Of the chosen structure; the message says that it was chosen."""
-        poles = self.poles[self.chosen]
-        orders = f"{poles.structure.order} and {poles.structure.numerator_order}"
-        return poles.noting(f"orders {orders} chosen by description length from {len(self.mdl)}")
-
-    @property
-    def structure(self) -> ModelStructure:
-        """The chosen one."""
-        return self.poles[self.chosen].structure
-
-
 def choose_among(
     fit: Callable[[ModelStructure], Poles], candidates: Sequence[ModelStructure] = CANDIDATES
-) -> OrderChoice:
-    """Fit several structures to the same data and choose by minimum description length.
+) -> Poles:
+    """Fit several structures to the same data and choose by minimum description length; the message says so.
 
     Parameters
     ----------
@@ -438,18 +406,19 @@ def choose_among(
     if not fits:
         assert refused is not None
         raise refused
-    poles = tuple(fits)
-    mdl = tuple(_description_length(p) for p in poles)
-    chosen = int(np.argmin(mdl))
-    if not np.isfinite(mdl[chosen]):
+    lengths = [_description_length(poles) for poles in fits]
+    best = fits[int(np.argmin(lengths))]
+    if not np.isfinite(min(lengths)):
         raise ValueError(
             "candidates: none has a result with a known level of noise, more lines or smaller orders "
             "are needed"
         )
-    return OrderChoice(poles, mdl, chosen)
+    orders = f"{best.structure.order} and {best.structure.numerator_order}"
+    return best.noting(f"orders {orders} chosen by description length from {len(fits)}")
 
 
 def _description_length(poles: Poles) -> float:
+    """``(cost / F) exp(n log(2 F) / (2 F - n - 2))``, corrected for few lines; infinite without a result."""
     usable = (PolesStatus.OK, PolesStatus.MODEL_ERROR, PolesStatus.NO_RESONANCE)
     data, n = 2 * poles.lines, poles.structure.parameters
     if poles.status not in usable or data <= n + 2 or not np.isfinite(poles.cost):

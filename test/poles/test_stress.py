@@ -274,9 +274,9 @@ def test_order_is_chosen_by_description_length(modes):
     noise = 1e-3 * (rng.standard_normal(41) + 1j * rng.standard_normal(41)) / np.sqrt(2)
     g = modal(LINES_HZ, [240, 262][:modes], [0.02] * modes, [0.04, 0.03][:modes]) + noise
     given = frf(LINES_HZ, g, variance_noise=1e-6 * rng.gamma(7, 1 / 7, 41), noise_dof=7)
-    choice = choose_among(lambda structure: identify_frf(given, None, structure))
-    assert choice.structure.order == 2 * modes
-    assert choice.best.status is PolesStatus.OK
+    poles = choose_among(lambda structure: identify_frf(given, None, structure))
+    assert poles.structure.order == 2 * modes
+    assert poles.status is PolesStatus.OK
 
 
 def test_pole_against_high_precision_reference():
