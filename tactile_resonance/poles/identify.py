@@ -222,7 +222,7 @@ def _identify(
     shape: tuple[int, ...],
     method: str,
 ) -> PolesBatch:
-    data, used = lines.data, lines.usable.sum(axis=-1)
+    data, used = lines.data, lines.known.lines
     if frequency_hz.size < structure.fewest_lines or used.size == 0:
         # bases need points: any will do, nothing is fitted
         places = max(structure.order, structure.numerator_order) + 1

@@ -164,8 +164,6 @@ class WeightedLines:
         With variances that are infinite on lines left out.
     known : VarianceModel
         What is known of these variances; says nothing of points without any.
-    usable : (batch, F) bool
-        Lines that are not left out.
     level_known : (batch,) bool
         Whether there is a variance above 0 at all; points without are weighted alike on all lines.
     total_known : bool
@@ -176,7 +174,6 @@ class WeightedLines:
 
     data: BinData
     known: VarianceModel
-    usable: BoolArray
     level_known: BoolArray
     total_known: bool = False
     noise: FloatArray | None = None
@@ -212,7 +209,6 @@ def lines_of_frf(frf: FRF) -> WeightedLines:
     return WeightedLines(
         BinData.of(g[:, None], np.ones((1, 1, g.shape[1])), variance_y=weights),
         known,
-        usable,
         level_known,
         frf.variance_total is not None,
         None if noise is None or frf.variance_total is None else noise.reshape(flat_shape),
@@ -262,7 +258,6 @@ def lines_of_spectra(
             covariance_yu=c_yu,
         ),
         known,
-        usable,
         level_known,
     )
 
