@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_n
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.level_set import LevelSet
 from tactile_resonance.scan.map_messages import (
+    boundary_markers,
     cloud_message,
     legend_message,
     marker_message,
@@ -294,9 +295,16 @@ class PoleMapNode(ManagedNode):
         pole_map = self._grown.map
         scale = self._scale(pole_map, probability)
         tissues = tuple(tissue.name for tissue in self._classes)
+
+        def markers() -> Any:
+            beside: Sequence[Any] = ()
+            if self._wanted is not None:
+                beside = boundary_markers(pole_map, pole_map.boundary(self._wanted), header)
+            return marker_message(pole_map, scale, probability, header, beside)
+
         makers: dict[str, Callable[[], Any]] = {
             "": lambda: cloud_message(pole_map, tissues, header),
-            "/markers": lambda: marker_message(pole_map, scale, probability, header, self._wanted),
+            "/markers": markers,
             "/legend": lambda: legend_message(pole_map, scale, probability, tissues, header),
             "/surface": lambda: surface_message(pole_map, cells, header),
         }

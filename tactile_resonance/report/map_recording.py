@@ -16,9 +16,8 @@ from typing import Any
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import quaternion_from_vector, vector
 from tactile_resonance.report.run_report import scene_of
-from tactile_resonance.scan.adaptive import WantedBoundary
-from tactile_resonance.scan.level_set import LevelSet
 from tactile_resonance.scan.map_messages import (
+    boundary_markers,
     cloud_message,
     legend_message,
     marker_message,
@@ -69,12 +68,18 @@ def write_map_recording(run: RunContent) -> Path | None:
         step = -(-len(results) // states)
         last = GrowingMap(results).map
         names = tuple(name for name in last.classes() if name != UNKNOWN)
-        wanted = _wanted(run)
-        grown = GrowingMap()
+        scene = scene_of(run)
+        adaptive = None if scene is None else scene.adaptive
+        grown, latest = GrowingMap(), {}
         for done, result in enumerate(results, start=1):
             grown.take(result)
+            latest[result.index] = result
             if (len(results) - done) % step == 0:  # the last one is among them
-                _write_map(writer, result.time_ns, grown.map, frame_id, names, wanted)
+                header, beside = header_message(frame_id, result.time_ns), []
+                if adaptive is not None:
+                    boundary = adaptive.boundary(latest.values())
+                    beside = boundary_markers(grown.map, boundary, header)
+                _write_map(writer, result.time_ns, grown.map, header, names, beside)
         ended_ns = results[-1].time_ns
         surface = surface_message(last, _CELLS, header_message(frame_id, ended_ns))
         _write(writer, "/pole_map/surface", ended_ns, surface, _LATCHED)
@@ -83,26 +88,18 @@ def write_map_recording(run: RunContent) -> Path | None:
     return run.path / FILE
 
 
-def _wanted(run: RunContent) -> LevelSet | None:
-    """What the boundary is of that an adaptive scan was to find."""
-    scene = scene_of(run)
-    asked = None if scene is None or scene.adaptive is None else scene.adaptive.wanted
-    return asked.level_set if isinstance(asked, WantedBoundary) else None
-
-
 def _write_map(
     writer: PointFileWriter,
     time_ns: int,
     pole_map: PoleMap,
-    frame_id: str,
+    header: Any,
     names: tuple[str, ...],
-    wanted: LevelSet | None,
+    beside: Sequence[Any],
 ) -> None:
-    header = header_message(frame_id, time_ns)
     scale = pole_map.ellipse_scale(_PROBABILITY)
     for name, message in {
         "": cloud_message(pole_map, names, header),
-        "/markers": marker_message(pole_map, scale, _PROBABILITY, header, wanted),
+        "/markers": marker_message(pole_map, scale, _PROBABILITY, header, beside),
         "/legend": legend_message(pole_map, scale, _PROBABILITY, names, header),
     }.items():
         _write(writer, f"/pole_map{name}", time_ns, message, _LATCHED)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import counted
 from tactile_resonance.recording.messages import POLES_STATUS, write_header
-from tactile_resonance.scan.level_set import LevelSet
+from tactile_resonance.scan.level_set import Boundary
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, colours, shares
 
@@ -77,9 +77,9 @@ def marker_message(
     scale: EllipseScale,
     probability: float,
     header: Message,
-    wanted: LevelSet | None = None,
+    beside: Sequence[Message] = (),
 ) -> Message:
-    """Markers: ellipses of all points, crosses where one failed, the boundary that is wanted, its band."""
+    """Markers: ellipses of all points, crosses where one failed, what lies beside them: `boundary_markers`."""
     ellipses = _marker(header, "ellipses", 0, "LINE_LIST")
     crosses = _marker(header, "failures", 0, "LINE_LIST")
     if pole_map.estimated:
@@ -98,17 +98,16 @@ def marker_message(
         crossed = [p.position_m + 0.2 * pole_map.spacing_m * arms for p in pole_map.failures]
         crosses.points = _points(np.array(crossed).reshape(-1, 3))
         (crosses.color,) = _colours([_FAILED])
-    markers = [ellipses, crosses, *_boundary_markers(pole_map, wanted, header)]
+    markers = [ellipses, crosses, *beside]
     return make_message(MARKERS, markers=[m if m.points else _deleted(m) for m in markers])
 
 
-def _boundary_markers(pole_map: PoleMap, wanted: LevelSet | None, header: Message) -> list[Message]:
-    """Outline and band; both empty where too few points have a pole."""
-    if wanted is None:
-        return []
+def boundary_markers(
+    pole_map: PoleMap, boundary: Boundary | None, header: Message
+) -> list[Message]:
+    """Outline of a boundary on a map, and the band that holds it; both empty where none is known."""
     outline, band = (_marker(header, "boundary", k, "LINE_LIST") for k in range(2))
     (band.color,) = _colours([_WHITE], 0.5)
-    boundary = pole_map.boundary(wanted)
     if boundary is not None:
         z = float(np.median(pole_map.positions_m[:, 2]))
         for marker, lines, width in (

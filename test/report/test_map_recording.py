@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map of a run as a recording of its own: what it shows, when, and where its frames stand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tactile_resonance.configuration import share_path
 from tactile_resonance.report import map_recording
+from tactile_resonance.report.boundary import boundary_of_run
 from tactile_resonance.report.map_recording import write_map_recording
 from tactile_resonance.scan.map_messages import CLOUD, MARKERS, POINT
 from tactile_resonance.scan.messages import make_message, to_cdr
@@ -14,6 +18,7 @@ from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointRe
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
+from tactile_resonance.scan.scene import read_scan_scene
 
 TABLE_IN_BASE = [0.3, -0.1, 0.05, 0.0, 0.0, np.pi / 2]
 TIP = Rotation.from_rotvec([0.1, 0.2, -0.3])
@@ -139,3 +144,29 @@ def test_without_a_point_there_is_no_map(tmp_path):
     RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}).close()
     assert write_map_recording(read_run(tmp_path / "run")) is None
     assert not (tmp_path / "run" / "map.mcap").exists()
+
+
+def test_the_boundary_drawn_is_that_of_boundary_json(tmp_path):
+    """Of an adaptive scan, whose scene states the region and the smallest thing that is looked for."""
+    scene = share_path("config/scenes/demo.yaml")
+    adaptive = read_scan_scene(scene).adaptive
+    places = adaptive.places_m()
+    touched = np.vstack([places[adaptive.first(places)], [[0.002, -0.001], [0.003, 0.002]]])
+    f0_hz = 258.0 - 4.2 * (np.linalg.norm(touched - [0.002, -0.001], axis=1) / 0.006) ** 2
+    at = ((float(x), float(y), 0.0) for x, y in touched)
+    plan = [ScanPoint(k, place, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)) for k, place in enumerate(at)]
+    facts = {"scan_node": {"table_in_base": TABLE_IN_BASE, "base_frame": "base"}}
+    with RunDirectory.create(tmp_path / "run", scene.read_text(), plan, facts) as run:
+        for point in plan:
+            x_m, y_m, _ = point.position_m
+            with run.begin_point(point.index) as recording:
+                result = result_of(point.index, f0_hz=float(f0_hz[point.index]))
+                recording.finish(replace(result, x_m=x_m, y_m=y_m))
+    content = read_run(tmp_path / "run")
+    found = boundary_of_run(content).boundary
+    assert found.outline_m
+    *_, (_, last) = told(write_map_recording(content), "/pole_map/markers")
+    outline, band = (marker for marker in last.markers if marker.ns == "boundary")
+    for marker, lines in ((outline, found.outline_m), (band, (*found.inner_m, *found.outer_m))):
+        drawn = [(point.x, point.y) for point in marker.points[::2]]  # each begins a stretch of a line
+        np.testing.assert_allclose(drawn, np.concatenate([line[:-1] for line in lines]), atol=1e-12)
