@@ -148,7 +148,7 @@ class ManagerNode(Node):
         """One step of one node: a question asked, unless one is under way."""
         now_s = time.monotonic()
         if node.pending is not None:
-            node.due = bool(moves)
+            node.due = node.state in moves
             if now_s > node.deadline_s:
                 self._drop(node)
             return
@@ -166,6 +166,8 @@ class ManagerNode(Node):
         (timeout_s,) = values(self, "answer_timeout_s")
         if client is node.get:
             timeout_s = min(timeout_s, STATE_WITHIN_S)
+        else:  # its event may state where it came to before the answer does
+            node.state = State.PRIMARY_STATE_UNKNOWN
         node.client, node.pending = client, client.call_async(request)
         node.deadline_s = now_s + timeout_s
         node.pending.add_done_callback(lambda future: self._hear(node, future))
@@ -176,7 +178,7 @@ class ManagerNode(Node):
             before, due, node.due = node.state, node.due, False
             node.pending = None
             self._take(node, answer.result(), time.monotonic())
-            if due or node.state != before:
+            if due or node.client is node.change or node.state != before:
                 self._tick()
 
     def _take(self, node: _Managed, answer: Any, now_s: float) -> None:
@@ -190,7 +192,6 @@ class ManagerNode(Node):
             else:  # asked again, also one that is on its way
                 node.state = state
             return
-        node.state = State.PRIMARY_STATE_UNKNOWN  # asked next
         if answer.success:
             node.refusals = 0
             return

@@ -78,6 +78,32 @@ def test_one_tick_brings_all_up_in_order(stack):
     assert stack.log == [(step, name) for name in stack.nodes for step in ("configure", "activate")]
 
 
+def test_that_all_are_active_is_logged_once(stack, monkeypatch):
+    """Where the events of the last node come before the answers to what it was asked."""
+    logged, late = [], []
+    logger = type(stack.manager.get_logger())
+    monkeypatch.setattr(logger, "info", lambda _, text, **__: logged.append(text))
+    managed, hear = stack.manager._nodes[-1], ManagerNode._hear
+
+    def hear_late(manager, node, answer):
+        if node is managed and node.client is node.change:
+            late.append(answer)
+        else:
+            hear(manager, node, answer)
+
+    monkeypatch.setattr(ManagerNode, "_hear", hear_late)
+    last = stack.nodes["third"]
+    assert stack.spin_until(lambda: last.count_subscribers("third/transition_event") == 1)
+    asked = [client for each in stack.manager._nodes for client in (each.get, each.change)]
+    assert stack.spin_until(lambda: all(client.service_is_ready() for client in asked))
+    stack.manager._tick()
+    for state in (State.PRIMARY_STATE_INACTIVE, State.PRIMARY_STATE_ACTIVE):
+        assert stack.spin_until(lambda: late and managed.state == state), stack.log  # noqa: B023
+        hear(stack.manager, managed, late.pop())
+    assert stack.spin_until(lambda: managed.pending is None)
+    assert logged == ["all active: first, second, third"]
+
+
 def test_a_node_that_is_deactivated_and_cleaned_up_at_once_is_held(stack):
     """No question of the manager falls in between; the node publishes its transitions."""
     assert stack.bring_up(), stack.log
