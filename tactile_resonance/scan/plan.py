@@ -56,8 +56,7 @@ class Plan:
     @property
     def skipped(self) -> tuple[Skipped, ...]:
         """Points and work left out, with the time saved."""
-        count = self.most_points
-        each = [replace(left, saved_s=left.saved_s * count) for left in self.measurement.skipped]
+        each = list(self.measurement.skipped)
         if near := self.near:
             at = counted(near, "point")
             what = f"rest for the tare, and height that the surface does not ask for, at {at}"
