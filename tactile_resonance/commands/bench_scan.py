@@ -49,7 +49,7 @@ NEW_RUNS = {
     "demo": (
         "demo.yaml",
         "a short scan over a hidden inclusion, on the simulated bench",
-        "What `scan` does, on a scene that takes little more than a minute: a simulated robot brings the "
+        "What `scan` does, on a scene that takes a minute or less: a simulated robot brings the "
         "sensor to 1 cN at up to 16 points of a gelatine phantom, chosen for the boundary of something stiffer "
         "hidden in it; boundary, poles, map and table follow, beside the simulation's truth. Nothing here is a "
         "measurement.",

@@ -6,6 +6,7 @@ Messages are those of rosbags, see `scan.messages.make_message`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np

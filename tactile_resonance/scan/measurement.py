@@ -122,7 +122,7 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     for band in use.bands:
         if band.low_hz < F_MIN_HZ or band.high_hz > top_hz:
             raise ValueError(
-                f"sensor.band: got {band.low_hz:g} to {band.high_hz:g} Hz; accepted is within "
+                f"sensor: got the band {band.low_hz:g} to {band.high_hz:g} Hz; accepted is within "
                 f"{F_MIN_HZ:g} to {top_hz:g} Hz"
             )
     if use.calibrated:
@@ -151,7 +151,7 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         found = lines_of(band.ends_hz, spacing_hz, share)
         if found <= fewest:
             raise ValueError(
-                f"sensor.band: got {found} excited lines from {band.low_hz:g} to {band.high_hz:g} Hz, "
+                f"sensor: got {found} excited lines in the band {band.low_hz:g} to {band.high_hz:g} Hz, "
                 f"{spacing_hz:g} Hz apart; accepted is more than {fewest}"
             )
     skipped = [_only_poles(use, lines, spacing_hz, top_hz)] if narrow else []
@@ -200,8 +200,11 @@ def _design_calibrated(scene: ScanScene, top_hz: float) -> MeasurementDesign:
     spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
     ends_hz = use.bands[0].ends_hz
     lines = lines_of(ends_hz, spacing_hz)
-    accepted = f"{FEWEST_CALIBRATED} excited lines or more, {spacing_hz:g} Hz apart"
-    require(lines >= FEWEST_CALIBRATED, "sensor.band", list(ends_hz), accepted)
+    if lines < FEWEST_CALIBRATED:
+        raise ValueError(
+            f"sensor: got {lines} excited lines in the band {ends_hz[0]:g} to {ends_hz[1]:g} Hz, "
+            f"{spacing_hz:g} Hz apart; accepted is {FEWEST_CALIBRATED} or more"
+        )
     least = 1 if isinstance(scene.precision, Separate) else BlockLimits().least
     blocks = scene.blocks or BlockLimits(least, max(least, math.ceil(CALIBRATED_MOST_S / block_s)))
     return replace(

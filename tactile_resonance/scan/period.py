@@ -96,7 +96,7 @@ def shortest_samples(
         least_hz = lines_wanted(band) / share / LONGEST_S
         if width_hz < least_hz:
             raise ValueError(
-                f"sensor.band: got {band.low_hz:g} to {band.high_hz:g} Hz with samples_per_period auto; "
+                f"sensor: got the band {band.low_hz:g} to {band.high_hz:g} Hz with samples_per_period auto; "
                 f"accepted is {least_hz:.2g} Hz wide or more, for a period of {LONGEST_S:g} s at most"
             )
     fewest = max(

@@ -123,7 +123,7 @@ def test_a_band_too_narrow_for_a_period_is_refused_at_once(width_hz):
     scene = read_scan_scene(SCENE)
     use = replace(scene.sensor, band_high_hz=200.0 + width_hz)
     with pytest.raises(
-        ValueError, match=r"^sensor.band: got 200 to .* with samples_per_period auto"
+        ValueError, match=r"^sensor: got the band 200 to .* with samples_per_period auto"
     ):
         design_measurement(replace(scene, sensor=replace(use, residual_terms=15)))
 
