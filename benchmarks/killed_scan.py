@@ -78,6 +78,8 @@ class KilledScan:
         Of the grid that is scanned.
     robot_host : str
         127.x.y.z of a simulated robot with load cell; empty: ideal contact. Either in simulated time.
+    prefix : sequence of str
+        Before the command of each node: see `NodeProcesses`.
 
     Attributes
     ----------
@@ -93,8 +95,14 @@ class KilledScan:
         What its feedback has told last.
     """
 
-    def __init__(self, folder: Path, points: tuple[int, int], robot_host: str = "") -> None:
-        self._folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        points: tuple[int, int],
+        robot_host: str = "",
+        prefix: Sequence[str] = (),
+    ) -> None:
+        self._folder, self._prefix = folder, prefix
         self._points = points[0] * points[1]
         scene = folder / "scene.yaml"
         size = [0.003 * (n - 1) for n in points]
@@ -115,7 +123,7 @@ class KilledScan:
     def __enter__(self) -> KilledScan:
         from tactile_resonance.nodes.client import ScanClient
 
-        self.processes = NodeProcesses(self._folder / "log")
+        self.processes = NodeProcesses(self._folder / "log", self._prefix)
         self.client = ScanClient(self.processes.check)
         self.client.__enter__()
         self.start((*self.nodes, MANAGER))
