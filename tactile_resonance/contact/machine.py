@@ -24,7 +24,7 @@ from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.outcome import Outcome
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.pressing import Pressing
+from tactile_resonance.contact.pressing import Pressing, TissueMotion
 from tactile_resonance.contact.result import Breach, Cause, ContactResult, NotIdleError
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.tare import Zero
@@ -132,11 +132,11 @@ class ContactController:
         return self._outcome.result(self.state is State.HOLD)
 
     @property
-    def motion(self) -> str:
-        """How tissue that moves does so under the held tip, in a sentence; empty where it is still."""
+    def motion(self) -> TissueMotion | None:
+        """How tissue that moves does so under the held tip; None where none is seen."""
         model, goal = self._observer.model, self.goal
         if model is None or not model.moving or goal is None or goal.aim.hold is not HoldMode.FORCE:
-            return ""  # a tip that keeps its place says nothing of the tissue's
+            return None  # a tip that keeps its place says nothing of the tissue's
         return self._pressing.motion.describe()
 
     @property

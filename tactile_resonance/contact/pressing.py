@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -38,13 +39,36 @@ PADDED = 8
 """By which the spectrum is finer than the heights' own."""
 
 
+@dataclass(frozen=True)
+class TissueMotion:
+    """How far and how often tissue moves under the tip that follows it.
+
+    Attributes
+    ----------
+    half_way_m : float
+        Creep taken off where the motion has turned often enough.
+    seen_s : float
+        For so long.
+    rate_hz : float or None
+        None where it has not turned often enough.
+    """
+
+    half_way_m: float
+    seen_s: float
+    rate_hz: float | None = None
+
+    def __str__(self) -> str:
+        often = f"in {self.seen_s:.1f} s" if self.rate_hz is None else f"at {self.rate_hz:.1f} Hz"
+        return f"moving tissue: {1e6 * self.half_way_m:.0f} um {often}"
+
+
 class HeldMotion:
     """Heights of a tip that holds a force on tissue that moves."""
 
     def __init__(self) -> None:
         self._times_ns: deque[int] = deque(maxlen=NEWEST)
         self._heights_m: deque[float] = deque(maxlen=NEWEST)
-        self._described = 0, ""  # when, and what
+        self._described: tuple[int, TissueMotion | None] = 0, None  # when, and what
 
     def add(self, time_ns: int, height_m: float) -> None:
         """Take the height of the tip along the normal, with its time."""
@@ -53,18 +77,15 @@ class HeldMotion:
             times.append(time_ns)
             self._heights_m.append(height_m)
 
-    def describe(self) -> str:
-        """Say how far and how often it moves, as `moving tissue: 200 um at 1.2 Hz`; empty before it is known.
-
-        The distance is half of the whole way, creep taken off where the motion has turned often enough.
-        """
+    def describe(self) -> TissueMotion | None:
+        """How it moves; None before it is known."""
         if self._times_ns and self._times_ns[-1] - self._described[0] >= ANEW_NS:
-            self._described = self._times_ns[-1], self._sentence()
+            self._described = self._times_ns[-1], self._motion()
         return self._described[1]
 
-    def _sentence(self) -> str:
+    def _motion(self) -> TissueMotion | None:
         if len(self._times_ns) < LEAST_S * 1e9 / EVERY_NS:
-            return ""
+            return None
         t_s = (np.array(self._times_ns) - self._times_ns[0]) * 1e-9  # (n,)
         heights = np.array(self._heights_m)
         crept = heights - np.polyval(np.polyfit(t_s, heights, 1), t_s)
@@ -73,13 +94,13 @@ class HeldMotion:
         power = np.abs(np.fft.rfft(np.interp(even, t_s, crept), PADDED * even.size)) ** 2
         rate_hz = np.argmax(power) / (PADDED * even.size * EVERY_NS * 1e-9)
         if rate_hz * t_s[-1] < LEAST_TURNS:
-            return f"moving tissue: {_half_way_um(heights):.0f} um in {t_s[-1]:.1f} s"
-        return f"moving tissue: {_half_way_um(crept):.0f} um at {rate_hz:.1f} Hz"
+            return TissueMotion(_half_way_m(heights), float(t_s[-1]))
+        return TissueMotion(_half_way_m(crept), float(t_s[-1]), float(rate_hz))
 
 
-def _half_way_um(heights_m: FloatArray) -> float:
+def _half_way_m(heights_m: FloatArray) -> float:
     low, high = np.percentile(heights_m, INNER)
-    return 0.5e6 * float(high - low)
+    return 0.5 * float(high - low)
 
 
 LOST_GRACE_S = 0.02

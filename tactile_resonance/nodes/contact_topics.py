@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -88,7 +89,9 @@ class ContactTopics:
         controller, loop = thread.controller, thread.loop
         state = contact_state(cycle, ros_ns, controller.estimate, controller.result, self._frame_id)
         if cycle.state is State.HOLD:
-            state.message = controller.motion
+            motion = controller.motion
+            state.message = "" if motion is None else str(motion)
+            state.tissue_moves_m = math.nan if motion is None else motion.half_way_m
         state.cycles, state.overruns = loop.cycles, loop.overruns
         self._say(state)
 

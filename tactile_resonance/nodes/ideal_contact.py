@@ -268,7 +268,7 @@ class IdealContact:
         state = msg.ContactState(state=self._state.value, force_n=NAN, depth_m=NAN)
         state.header.stamp, state.header.frame_id = now, self._frame_id
         state.instance, state.stopped = self._node.instance, self._stop.stopped
-        state.zero_moved_n = state.stiffness_n_per_m = NAN
+        state.zero_moved_n = state.stiffness_n_per_m = state.tissue_moves_m = NAN
         if result is not None:
             state.cause, state.message = result.cause.value, result.message
         if self._state is State.HOLD:

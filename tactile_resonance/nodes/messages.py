@@ -300,7 +300,7 @@ def contact_state(
     frame_id: str,
 ) -> msg.ContactState:
     """What the controller does and knows, without the loop's counts."""
-    state = msg.ContactState(state=cycle.state.value)
+    state = msg.ContactState(state=cycle.state.value, tissue_moves_m=math.nan)
     state.header.stamp = time_message(ros_ns(cycle.time_ns))
     state.header.frame_id = frame_id
     state.force_n, state.depth_m, state.stiffness_n_per_m = _known(estimate)

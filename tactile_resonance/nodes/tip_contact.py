@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable
 from typing import Any
@@ -37,8 +36,6 @@ from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
 
 STATE_TOPIC = "contact_state"
-HALF_WAY = re.compile(r"moving tissue: (\d+) um ")
-"""In the message of a contact that is held: `HeldMotion.describe`."""
 TOUCH_RETRACT_WITHIN_S = 20.0  # after a touch of a surface that is searched for
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
@@ -107,12 +104,8 @@ class TipContact:
 
     @property
     def tissue_moves_m(self) -> float:
-        """Half the way of tissue that the tip follows while it holds its force [m]; 0: none is seen."""
-        state = self._state
-        if state is None or state.state != state.STATE_HOLD:
-            return 0.0
-        found = HALF_WAY.match(state.message)
-        return 1e-6 * float(found[1]) if found else 0.0
+        """Half the way of tissue that the tip follows while it holds its force [m]; NaN: none is seen."""
+        return math.nan if self._state is None else self._state.tissue_moves_m
 
     def hold(
         self,

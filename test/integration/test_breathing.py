@@ -12,7 +12,7 @@ pytest.importorskip("rtde_control", reason="ur-rtde is not here")
 from robot_at_hand import own_host
 
 from benchmarks.load_case import Load, demonstrate
-from tactile_resonance.report.point_details import deviations, truths_of
+from tactile_resonance.report.point_details import STATE_TYPE, deviations, truths_of
 from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.recorded import RECORD
@@ -47,10 +47,10 @@ class Breathed:
     def done(self):
         return [r for r in self.run.latest if r.outcome is PointOutcome.DONE]
 
-    def records(self, index):
-        """Those of a point, whether they count or not."""
+    def recorded(self, index, kind):
+        """Messages of a point, whether they count or not."""
         path = next((self.run.path / "recording").glob(f"point-{index:05}-*.mcap"))
-        return [message for _, _, message in read_messages(path, RECORD)]
+        return [message for _, _, message in read_messages(path, kind)]
 
 
 def breathe(folder, motion, blocks, more=""):
@@ -84,9 +84,14 @@ def test_tissue_that_breathes_is_measured_and_its_motion_stated(domain, tmp_path
     found = breathe(tmp_path, {**MOTION, "breath_power": 1}, blocks=4)
     assert len(found.done) == 3
     # it did move: the tip followed the breath of a flat surface, creep is 20 um
-    heights = [r.tip_pose.pose.position.z for n in range(3) for r in found.records(n)]
+    heights = [r.tip_pose.pose.position.z for n in range(3) for r in found.recorded(n, RECORD)]
     assert 0.2 * MOTION["breath_m"] < np.ptp(heights) < 2 * MOTION["breath_m"]
     assert len(heights) == 3 * 4
+    # contact_node stated half of the way that it saw, while it held the tip and not otherwise
+    states = [state for n in range(3) for state in found.recorded(n, STATE_TYPE)]
+    stated = np.array([state.tissue_moves_m for state in states if state.state == "hold"])
+    assert 0.1 * MOTION["breath_m"] < np.nanmax(stated) < MOTION["breath_m"]
+    assert all(np.isnan(state.tissue_moves_m) for state in states if state.state != "hold")
     page = (found.run.path / "report.html").read_text()
     assert "rms of the force, smallest to largest [mN]" in page
 
@@ -101,6 +106,6 @@ def test_a_gate_keeps_what_is_measured_between_breaths(domain, tmp_path):
     left_out = [r for r in found.run.latest if r.gate or r.reason.startswith("gate: ")]
     assert left_out
     for result in left_out:
-        assert len(found.records(result.index)) > result.blocks  # all of it is recorded
+        assert len(found.recorded(result.index, RECORD)) > result.blocks  # all of it is recorded
     for result in set(found.done) - set(left_out):
-        assert len(found.records(result.index)) == result.blocks
+        assert len(found.recorded(result.index, RECORD)) == result.blocks

@@ -61,21 +61,6 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     assert tip.spent_s["hold_s"] == pytest.approx(0.08)
 
 
-@pytest.mark.parametrize(
-    ("state", "message", "half_way_m"),
-    [
-        ("hold", "moving tissue: 200 um at 1.2 Hz", 2e-4),
-        ("hold", "moving tissue: 16 um in 0.8 s", 1.6e-5),
-        ("hold", "", 0.0),
-        ("idle", "drawn back as asked for; moving tissue: 200 um at 1.2 Hz", 0.0),
-    ],
-)
-def test_how_far_tissue_moves_is_read_from_the_contact_that_holds(state, message, half_way_m):
-    tip = TipContact.__new__(TipContact)
-    tip._state = msg.ContactState(state=state, message=message)
-    assert tip.tissue_moves_m == pytest.approx(half_way_m)
-
-
 def drawn_back(monkeypatch, **state):
     """What `retract` comes to where contact_node then reports this state."""
     tip = TipContact.__new__(TipContact)
