@@ -68,7 +68,7 @@ def test_motion_that_has_not_turned_has_no_rate():
         motion.add(n * 20_000_000 + 10**9, 1e-4 * np.sin(np.pi * n / 50))
     found = motion.describe()
     assert found.rate_hz is None
-    assert found.half_way_m == pytest.approx(0.5e-4, rel=0.05)
+    assert found.half_way_m == pytest.approx(0.5e-4, rel=0.1)  # the outermost hundredths left out
     assert str(found) == f"moving tissue: {1e6 * found.half_way_m:.0f} um in 1.0 s"
 
 
