@@ -20,7 +20,7 @@ from tactile_resonance.poles.fit import Solution, minimise, refit_failed
 from tactile_resonance.poles.joint_noise import TINY, rules_between, with_noise
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import asks, lacking_terms
-from tactile_resonance.poles.levels import Levels, level_of_one, line_pieces, smooth_variance
+from tactile_resonance.poles.levels import Level, Levels, line_pieces, smooth_variance
 from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.model_error import systematic_of
 from tactile_resonance.poles.noise_level import Pieces, are_flat
@@ -241,14 +241,13 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     solution, data = fitted.solution, fitted.data
     theta, inverse = solution.theta[:, 0], solution.marginal[:, 0]
     batch = len(theta)
-    level = level_of_one(plan, solution, fitted.noise, fitted.kind == 2)
-    scale, correction, cost, expected, contradicts, noise = level
-    residual = solution.residual[:, 0] * (1 / np.sqrt(scale))[:, None]
-    suspect = are_smooth(residual, plan.structure.parameters) | contradicts
+    level = Level.of(plan, solution, fitted.noise, fitted.kind == 2)
+    residual = solution.residual[:, 0] * (1 / np.sqrt(level.scale))[:, None]
+    suspect = are_smooth(residual, plan.structure.parameters) | level.suspect
     lacking = np.full((batch, 3), np.nan)
     asked = _may_return(solution)
     if batch > 1:
-        asked &= suspect | asks(plan, cost, expected, residual)
+        asked &= suspect | asks(plan, level.cost, level.expected, residual)
     if asked.any():
         rows = np.flatnonzero(asked)
         part = data if rows.size == batch else data.rows(rows)
@@ -256,13 +255,13 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         suspect = suspect | np.isfinite(lacking[:, 0])
     if suspect.any():  # what rounding leaves of exact data says nothing
         rows = np.flatnonzero(suspect)
-        of_noise = (scale * data.variance_y.min(axis=1))[rows]
+        of_noise = (level.scale * data.variance_y.min(axis=1))[rows]
         suspect[rows] = of_noise > ROUNDED * _mean_power(data.rows(rows))
         lacking[~suspect] = np.nan
     # others are fitted once more
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
-    covariance = inverse * (0.5 * scale * correction)[:, None, None]
+    covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
     known = plan.level_known
     return Judged.of(
         plan,
@@ -271,14 +270,14 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         condition_number=solution.condition,
         converged=solution.converged,
         residual=residual,
-        cost=cost,
-        expected_cost=expected,
+        cost=level.cost,
+        expected_cost=level.expected,
         suspect=suspect,
         covariance=covariance if known else np.full_like(covariance, np.nan),
         total=None if known else covariance,
         kind=fitted.kind,
         level_known=np.full(batch, known),
-        noise_variance=noise,
+        noise_variance=level.noise,
         systematic=systematic_of(plan, data, solution.theta, wrong),
         lacking=lacking,
     )
