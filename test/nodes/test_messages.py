@@ -2,6 +2,9 @@
 """Objects survive the way through messages and their serialisation bit by bit."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from tactile_resonance.multisine import Grid, design_multisine  # noqa: E402
 from tactile_resonance.nodes import messages  # noqa: E402
 from tactile_resonance.poles.result import Poles, PolesStatus  # noqa: E402
 from tactile_resonance.poles.structure import PoleBand  # noqa: E402
+from tactile_resonance.processes import free_domain_id  # noqa: E402
 from tactile_resonance.record import (  # noqa: E402
     BetweenSamples,
     Channel,
@@ -224,3 +228,29 @@ def test_reading_makes_no_copy():
     record = stored.record_from_message(message)
     message.sensor_v[2] = 5.0
     assert record.sensor.samples[2] == 5.0
+
+
+OFFERED = """
+import rclpy
+from rclpy.action import ActionServer
+from tactile_resonance import msg
+from tactile_resonance.action import Scan
+from tactile_resonance.nodes.running import initialised
+
+with initialised():
+    node = rclpy.create_node("offering")
+    node.create_publisher(msg.FRF, "frf", 1)
+    ActionServer(node, Scan, "scan", lambda goal: None)
+"""
+
+
+def test_all_kinds_of_messages_that_the_middleware_asks_for_were_built():
+    """Fast DDS reports those that it misses on stderr, and goes on without them."""
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(free_domain_id(os.environ)),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    command = [sys.executable, "-W", "ignore", "-c", OFFERED]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    # a port of shared memory that a node beside these tests took at that moment is reported too
+    assert [line for line in done.stderr.splitlines() if "RTPS_TRANSPORT_SHM" not in line] == []
