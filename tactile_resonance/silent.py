@@ -13,7 +13,7 @@ import numpy.typing as npt
 import scipy.fft
 from scipy import signal, special
 
-from tactile_resonance._typing import BoolArray, FloatArray
+from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.tones import Tone, level_around
 
 MOST_SAMPLES = 2**18
@@ -28,6 +28,8 @@ MAIN_LOBE = 4
 FIRST_BIN = 16
 """Below, a drift is too steep to be compared with what is around."""
 MOST_NAMED = 12
+DRIVEN = 100
+"""Power at excited lines over that between them, above which a record was not taken without drive."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,38 @@ def silent_record(
             tones.append(Tone(float(at * resolution_hz), float(rms_v), channel, resolution_hz))
     tones.sort(key=lambda tone: -tone.rms_v)
     return SilentRecord(tuple(tones), noise[0], noise[1], (float(edges[0]), float(edges[1])))
+
+
+def check_undriven(u: npt.NDArray[np.floating], harmonics: IntArray) -> None:
+    """Refuse a record whose actuator was driven at the lines that it says are excited.
+
+    Parameters
+    ----------
+    u : (M, P, N) float
+        Actuator [V]: M realisations of P consecutive periods. Of one period nothing lies between lines.
+    harmonics : (F,) int
+        Excited multiples of one over the period, ascending.
+
+    Raises
+    ------
+    ValueError
+        Where their power is more than `DRIVEN` times that between them.
+    """
+    realisations, periods, samples = u.shape
+    if periods == 1:
+        return
+    spectrum = scipy.fft.rfft(u.reshape(realisations, periods * samples))
+    power = np.mean(np.abs(spectrum) ** 2, axis=0)  # (K,), lines at multiples of the periods
+    lines = harmonics * periods
+    around = np.arange(lines[0] - 1, lines[-1] + 2)
+    driven, between = np.median(power[lines]), np.median(power[around[around % periods != 0]])
+    if driven > DRIVEN * between:
+        with np.errstate(divide="ignore"):  # of noise-free records there is nothing between
+            above_db = 10 * np.log10(driven / between)
+        raise ValueError(
+            f"record: the actuator has {above_db:.0f} dB more power at the excited lines than between them, "
+            "expected a record taken without drive; without --silent its response is estimated"
+        )
 
 
 def _pieces(x: FloatArray) -> FloatArray:

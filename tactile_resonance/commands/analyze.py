@@ -28,11 +28,9 @@ from tactile_resonance.front import read_record, read_run
 from tactile_resonance.poles.estimator import CANDIDATES
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, ModelStructure
 from tactile_resonance.recording.recording import Recording
-from tactile_resonance.silent import silent_record
+from tactile_resonance.silent import check_undriven, silent_record
 
 MOST_HARMONICS = 10**7
-DRIVEN = 100
-"""Power at excited lines over that between them, above which a record was not taken without drive."""
 
 OPTIONS = {
     "measurement_id": "--measurement",
@@ -249,7 +247,8 @@ def _run(options: argparse.Namespace) -> int:
         for name in ("json", "plot"):
             if getattr(options, name) is not None:
                 raise ValueError(f"--{name}: not with --silent, which prints")
-        _check_undriven(recording)
+        if recording.excited_harmonics is not None:
+            check_undriven(recording.u, recording.excited_harmonics)
         found = silent_record(recording.u, recording.y, sample_rate_hz=rate_hz, band_hz=band_hz)
         print(found.text())
         return 0
@@ -352,25 +351,6 @@ def _check_outputs(options: argparse.Namespace) -> None:
             require(not own, f"--{name}", str(path), "another file than the record itself")
     same = options.json is not None and options.json == options.plot
     require(not same, "--json, --plot", str(options.json), "two files")
-
-
-def _check_undriven(recording: Recording) -> None:
-    """ValueError where the actuator was driven at the lines that the record says are excited."""
-    realisations, periods, samples = recording.u.shape
-    if recording.excited_harmonics is None or periods == 1:
-        return
-    joined = recording.u.reshape(realisations, periods * samples)
-    power = np.mean(np.abs(np.fft.rfft(joined)) ** 2, axis=0)  # (K,), lines at multiples of the periods
-    lines = recording.excited_harmonics * periods
-    inside = np.arange(power.size)[lines[0] - 1 : lines[-1] + 2]
-    driven, between = np.median(power[lines]), np.median(power[inside[inside % periods != 0]])
-    if driven > DRIVEN * between:
-        with np.errstate(divide="ignore"):  # of noise-free records there is nothing between
-            above_db = 10 * np.log10(driven / between)
-        raise ValueError(
-            f"record: the actuator has {above_db:.0f} dB more power at the excited lines than between them, "
-            "expected a record taken without drive; without --silent its response is estimated"
-        )
 
 
 def _analyze_contacts(options: argparse.Namespace) -> int:
