@@ -117,7 +117,7 @@ def decide(
 ) -> Decision:
     """Whether the poles of all blocks so far are enough.
 
-    Two tissues are told apart by the main pole at the nominal contact. Otherwise the main modes of all bands
+    Two tissues are distinguished by the main pole at the nominal contact. Otherwise the main modes of all bands
     are to be as precise as wanted, and the first that is not decides: one for which more blocks are of use
     comes before one for which they are not.
 

@@ -176,7 +176,7 @@ def find_normals(
         except PointDisturbed:  # says nothing of the point
             raise
         except (PointFailed, ValueError) as error:
-            left.append((point, f"normals: {error}"))
+            left.append(LeftOut(point, f"normals: {error}"))
         else:
             found.append(normal)
     return tuple(found), tuple(left)

@@ -140,7 +140,7 @@ def recorded_results(run: RunContent) -> Iterator[bytes]:
 
 
 def last_poles(path: Path) -> Any:
-    """The last message of poles of a file, of which truths of a simulation are none; None: it has none.
+    """The last message of estimated poles in a file, truths of a simulation left out; None where there is none.
 
     Raises
     ------
