@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.linalg import lapack, solve_triangular
 from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -46,33 +46,52 @@ class _Process(NamedTuple):
     Attributes
     ----------
     xy_m : (n, 2) float
-    values : (n,) float
-    length_m, std, mean : float
-    factor : tuple
-        Of the covariance of the values, of `scipy.linalg.cho_factor`.
+    length_m, std : float
+    lower : (n, n) float
+        Cholesky factor of the covariance of the values.
+    mean : float
+        Of the process, by generalised least squares.
+    weights : (n,) float
+        The inverse of that covariance, times the values less their mean.
+    of_mean : (n,) float
+        `lower` solved for ones, times the deviation of the mean.
+    mean_std : float
     """
 
     xy_m: FloatArray
-    values: FloatArray
     length_m: float
     std: float
+    lower: FloatArray
     mean: float
-    factor: tuple[FloatArray, bool]
+    weights: FloatArray
+    of_mean: FloatArray
+    mean_std: float
+
+    @classmethod
+    def of(
+        cls, xy_m: FloatArray, y: FloatArray, noise: FloatArray, length_m: float, std: float
+    ) -> _Process:
+        """Of values (n,) with noise."""
+        covariance = std**2 * _matern(cdist(xy_m, xy_m) / length_m)
+        lower = np.linalg.cholesky(covariance + np.diag(noise**2 + _JITTER * std**2))
+        ones, values = _solved(lower, np.stack([np.ones(len(y)), y], axis=1)).T
+        known = float(ones @ ones)
+        mean = float(ones @ values) / known
+        weights = solve_triangular(lower, values - mean * ones, lower=True, trans="T")
+        return cls(xy_m, length_m, std, lower, mean, weights, ones / np.sqrt(known), 1 / np.sqrt(known))
 
     def before(self, a_m: FloatArray, b_m: FloatArray) -> FloatArray:
         """(p, q) covariance between (p, 2) and (q, 2) positions while no value is known."""
         return np.asarray(self.std**2 * _matern(cdist(a_m, b_m) / self.length_m))
 
-    def at(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """At (q, 2) positions: value (q,); covariance with the points (n, q); their weights (n, q); (q,).
+    def at(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """At (q, 2) positions: value (q,); (n, q), products of which are the covariance that points take off; (q,).
 
         The last is what the mean's uncertainty adds, as a standard deviation with a sign.
         """
         cross = self.before(self.xy_m, at_m)
-        weights = cho_solve(self.factor, cross)
-        known = _mean(self.factor, self.values)[1]
-        of_mean = (1 - np.sum(weights, axis=0)) / np.sqrt(known)
-        return self.mean + (self.values - self.mean) @ weights, cross, weights, of_mean
+        solved = _solved(self.lower, cross)
+        return self.mean + self.weights @ cross, solved, self.mean_std - self.of_mean @ solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +133,9 @@ class KrigedSurface:
         at = np.asarray(xy_m, float)
         values, variances = [], []  # of each process (q,)
         for process in self.processes:
-            value, cross, weights, of_mean = process.at(at.reshape(-1, 2))
+            value, solved, of_mean = process.at(at.reshape(-1, 2))
             values.append(value)
-            variances.append(process.std**2 - np.sum(cross * weights, axis=0) + of_mean**2)
+            variances.append(process.std**2 - np.einsum("nq,nq->q", solved, solved) + of_mean**2)
         value = self.shares @ values
         variance = self.shares @ (np.maximum(variances, 0) + (values - value) ** 2)
         return value.reshape(at.shape[:-1]), np.sqrt(variance).reshape(at.shape[:-1])
@@ -126,8 +145,9 @@ class KrigedSurface:
         a, b = np.asarray(a_m, float), np.asarray(b_m, float)
         total, means_a, means_b = np.zeros((len(a), len(b))), [], []
         for share, process in zip(self.shares, self.processes, strict=True):
-            (mean_a, cross, _, of_a), (mean_b, _, weights, of_b) = process.at(a), process.at(b)
-            total += share * (process.before(a, b) - cross.T @ weights + np.outer(of_a, of_b))
+            (mean_a, solved_a, of_a), (mean_b, solved_b, of_b) = process.at(a), process.at(b)
+            known = solved_a.T @ solved_b
+            total += share * (process.before(a, b) - known + np.outer(of_a, of_b))
             means_a.append(mean_a)
             means_b.append(mean_b)
         apart_a, apart_b = (np.array(means) - self.shares @ means for means in (means_a, means_b))
@@ -309,12 +329,9 @@ def _mixture(
     shares: FloatArray,
 ) -> KrigedSurface:
     """A surface of some processes, given by logarithms (k, 2) of length and size."""
-    processes = []
-    for length, std in np.exp(at).tolist():
-        factor = _factor(cdist(xy_m, xy_m), noise, length, std)
-        processes.append(_Process(xy_m, y, length, std, _mean(factor, y)[0], factor))
+    processes = tuple(_Process.of(xy_m, y, noise, *each) for each in np.exp(at).tolist())
     length_m, process_std = np.exp(best).tolist()
-    return KrigedSurface(xy_m, length_m, process_std, tuple(processes), shares)
+    return KrigedSurface(xy_m, length_m, process_std, processes, shares)
 
 
 def _surface(
@@ -354,18 +371,9 @@ def _cost(
     return float(cost), np.array([by_length, by_size]) / 2
 
 
-def _mean(factor: tuple[FloatArray, bool], y: FloatArray) -> tuple[float, float]:
-    """Mean by generalised least squares, and the inverse of its variance."""
-    weights = cho_solve(factor, np.ones(len(y)))
-    known = float(np.sum(weights))
-    return float(weights @ y) / known, known
-
-
-def _factor(
-    distances: FloatArray, noise: FloatArray, length: float, size: float
-) -> tuple[FloatArray, bool]:
-    covariance = size**2 * _matern(distances / length)
-    return cho_factor(covariance + np.diag(noise**2 + _JITTER * size**2), lower=True)
+def _solved(lower: FloatArray, right: FloatArray) -> FloatArray:
+    """(n, k) the factor (n, n), solved for (n, k)."""
+    return np.asarray(solve_triangular(lower, right, lower=True, check_finite=False))
 
 
 def _matern(ratio: FloatArray) -> FloatArray:

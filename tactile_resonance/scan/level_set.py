@@ -68,10 +68,12 @@ class LevelSet:
         with np.errstate(divide="ignore"):
             ratio = after / np.sqrt(np.maximum(std**2 - after**2, 0))
         low, high = np.abs(value - self.low), np.abs(self.high - value)
-        near, far = np.minimum(low, high) / std, np.maximum(low, high) / std
-        # what crosses both levels is on the wrong side from between them, and not from beside them
-        sign = np.where(self.depth(value) > 0, 1, -1)
-        return np.asarray(2 * owens_t(near, ratio) + sign * 2 * owens_t(far, ratio))
+        wrong = owens_t(np.minimum(low, high) / std, ratio)
+        if len(self.levels) == 2:
+            # what crosses both levels is on the wrong side from between them, and not from beside them
+            sign = np.where(self.depth(value) > 0, 1, -1)
+            wrong = wrong + sign * owens_t(np.maximum(low, high) / std, ratio)
+        return np.asarray(2 * wrong)
 
 
 @dataclass(frozen=True, eq=False)
