@@ -85,7 +85,7 @@ class _Process(NamedTuple):
         return np.asarray(self.std**2 * _matern(cdist(a_m, b_m) / self.length_m))
 
     def at(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """At (q, 2) positions: value (q,); (n, q), products of which are the covariance that points take off; (q,).
+        """At (q, 2) positions: value (q,), (n, q) whose products are the covariance that points take off, (q,).
 
         The last is what the mean's uncertainty adds, as a standard deviation with a sign.
         """
