@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import cholesky, lapack, solve_triangular
 from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -73,7 +73,7 @@ class _Process(NamedTuple):
     ) -> _Process:
         """Of values (n,) with noise."""
         covariance = std**2 * _matern(cdist(xy_m, xy_m) / length_m)
-        lower = np.linalg.cholesky(covariance + np.diag(noise**2 + _JITTER * std**2))
+        lower = np.asarray(cholesky(covariance + np.diag(noise**2 + _JITTER * std**2), lower=True), np.float64)
         ones, values = _solved(lower, np.stack([np.ones(len(y)), y], axis=1)).T
         known = float(ones @ ones)
         mean = float(ones @ values) / known
