@@ -303,8 +303,14 @@ def least_squares(
     """
     used = np.tile(np.isfinite(data.variance[0]), data.records)
 
+    newest: list[tuple[bytes, Linearised]] = []
+
     def at(theta: FloatArray) -> Linearised:
-        return Linearised.of(problem, data, theta, delay_phase)
+        """Kept: a Jacobian is asked for where the residuals were asked for last."""
+        key = theta.tobytes()
+        if not newest or newest[0][0] != key:
+            newest[:] = [(key, Linearised.of(problem, data, theta, delay_phase))]
+        return newest[0][1]
 
     def flat(values: npt.NDArray) -> npt.NDArray:
         """Real and imaginary parts of bins that are not left out."""
