@@ -27,6 +27,8 @@ from zlib import crc32
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
     Qos,
     QosDurability,
     QosHistory,
@@ -34,7 +36,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer, storage_mcap
+from rosbags.rosbag2 import CompressionMode, Reader, ReaderError, storage_mcap
 from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.serde import SerdeError
 from rosbags.typesys import TypesysError
@@ -59,7 +61,7 @@ _FOOTER, _CHUNK, _DATA_END = 0x02, 0x06, 0x0F
 _CHUNK_CRC = 24
 # Of the footer's: starts of summary and of its offsets come before the checksum.
 _FOOTER_CRC = 16
-_NEXT = ",\n    "  # between the entries of a list
+_NEXT = ",\n  "  # between the entries of a list
 _FOREVER = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
 
@@ -138,8 +140,9 @@ class PointFileWriter:
         self._target = target
         self._folder = hidden / target.stem
         shutil.rmtree(self._folder, ignore_errors=True)
-        self._writer = Writer(self._folder, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
-        self._writer.open()
+        self._folder.mkdir(parents=True)
+        # rosbags' Writer around it makes metadata of YAML, ten times the rest of a file
+        self._storage = storage_mcap.McapWriter(self._folder, CompressionMode.NONE)
         self._connections: dict[str, Connection] = {}
         self._open = True
 
@@ -173,20 +176,28 @@ class PointFileWriter:
         """
         if not self._open:
             raise ValueError(f"{self._target.name}: finished or abandoned, expected an open file")
-        connection = self._connections.get(topic)
-        if connection is None:
-            definition, type_hash = definition_and_hash(type_name)
-            connection = self._writer.add_connection(
-                topic,
-                type_name,
-                msgdef=definition,
-                rihs01=type_hash,
-                offered_qos_profiles=[] if qos is None else [qos],
-            )
-            self._connections[topic] = connection
+        connection = self._connections.get(topic) or self._add(topic, type_name, qos)
         if connection.msgtype != type_name:
             raise ValueError(f"type_name: got {type_name!r}; {topic} has {connection.msgtype}")
-        self._writer.write(connection, time_ns, cdr)
+        self._storage.write(connection, time_ns, cdr)
+
+    def _add(self, topic: str, type_name: str, qos: Qos | None) -> Connection:
+        definition, type_hash = definition_and_hash(type_name)
+        connection = Connection(
+            len(self._connections) + 1,
+            topic,
+            type_name,
+            MessageDefinition(MessageDefinitionFormat.MSG, definition),
+            type_hash,
+            0,
+            ConnectionExtRosbag2("cdr", [] if qos is None else [qos]),
+            self,
+        )
+        if type_name not in {known.msgtype for known in self._connections.values()}:
+            self._storage.add_msgtype(connection)
+        self._storage.add_connection(connection, _offered(connection))
+        self._connections[topic] = connection
+        return connection
 
     def finish(self, complete: Callable[[Path, FileContent], None] | None = None) -> FileContent:
         """Complete the file and give it its name, durably.
@@ -206,16 +217,17 @@ class PointFileWriter:
         if not self._open or not self._connections:
             raise ValueError(f"{self._target.name}: nothing written, expected one message or more")
         self._open = False
-        self._writer.close()
+        counts = self._storage.channel_stats
+        content = FileContent(
+            self._target.name,
+            self._storage.message_start_time,
+            self._storage.message_end_time,
+            tuple(_topic_of(c, c.digest, counts[c.id]) for c in self._connections.values()),
+        )
+        self._storage.close(BAG_VERSION, _bag_metadata([content]))
         written = self._folder / self._target.name
         write_checksums(written)
         sync(written)
-        content = FileContent(
-            self._target.name,
-            self._writer.min_timestamp,
-            self._writer.max_timestamp,
-            tuple(_topic_of(c, c.digest, self._writer.counts[c.id]) for c in self._writer.connections),
-        )
         if complete is not None:
             complete(written, content)
         written.rename(self._target)
@@ -227,7 +239,7 @@ class PointFileWriter:
         """Leave nothing behind; does nothing after `finish`."""
         if self._open:
             self._open = False
-            self._writer.abort()
+            self._storage.abort()
             shutil.rmtree(self._folder, ignore_errors=True)
 
 
@@ -250,10 +262,14 @@ def read_content(path: Path) -> FileContent:
 
 
 def _topic_of(connection: Connection, type_hash: str, count: int) -> TopicContent:
+    offered = _offered(connection)
+    return topic_content(connection.topic, connection.msgtype, type_hash, offered, count)
+
+
+def _offered(connection: Connection) -> str:
     assert isinstance(connection.ext, ConnectionExtRosbag2)
     offered = dump_qos_v9(list(connection.ext.offered_qos_profiles)[:1])
-    qos = json.dumps(offered, separators=(",", ":"))
-    return topic_content(connection.topic, connection.msgtype, type_hash, qos, count)
+    return json.dumps(offered, separators=(",", ":"))
 
 
 def read_messages(path: Path, *type_names: str) -> Iterator[tuple[int, str, Any]]:
@@ -299,6 +315,16 @@ def write_bag_metadata(folder: Path, files: Sequence[FileContent]) -> None:
         In any order; listed by the time of their first message. A topic must have one type, of one
         definition, in all of them.
     """
+    lines = "".join(f"  {line}\n" for line in _bag_metadata(files).splitlines())
+    write_whole(folder / "metadata.yaml", f"rosbag2_bagfile_information:\n{lines}".encode())
+    sync(folder)
+
+
+def _bag_metadata(files: Sequence[FileContent]) -> str:
+    """YAML that says what these files hold together.
+
+    JSON is YAML, and takes a hundredth of the time and memory of its nodes: a long run has ten thousand files.
+    """
     files = sorted(files, key=lambda file: (file.start_ns, file.name))
     start_ns = min((file.start_ns for file in files), default=0)
     end_ns = max((file.end_ns for file in files), default=0)
@@ -324,14 +350,12 @@ def write_bag_metadata(folder: Path, files: Sequence[FileContent]) -> None:
         "custom_data": None,
         "ros_distro": "rosbags",
     }
-    # JSON is YAML, and takes a hundredth of the time and memory of its nodes: a long run has ten thousand files
-    text = "rosbag2_bagfile_information:\n"
+    text = ""
     for key, value in content.items():
         listed = isinstance(value, list)
         told = f"[{_NEXT.join(map(json.dumps, value))}]" if listed else json.dumps(value)
-        text += f"  {key}: {told}\n"
-    write_whole(folder / "metadata.yaml", text.encode())
-    sync(folder)
+        text += f"{key}: {told}\n"
+    return text
 
 
 def _merged_topics(files: Sequence[FileContent]) -> list[TopicContent]:
