@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import shutil
 import signal
@@ -239,9 +238,7 @@ def run_job(job: Job) -> int:
     parameters = node_parameters(job, bool(content.tissue_classes), work, content.frame_id)
     parameters["pole_map_node"]["unknown_level"] = content.unknown_level
     if content.adaptive is not None and isinstance(content.adaptive.wanted, WantedBoundary):
-        ends = content.adaptive.wanted.level_set
-        finite = [end if math.isfinite(end) else 0.0 for end in (ends.low, ends.high)]
-        parameters["pole_map_node"]["boundary_f0_hz"] = finite
+        parameters["pole_map_node"]["adaptive_scene"] = str(job.scene)
     computing = () if priority or not job.real_time else COMPUTING
     try:
         with NodeProcesses(work / "log") as nodes:

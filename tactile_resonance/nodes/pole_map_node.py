@@ -14,13 +14,14 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from tactile_resonance import msg
-from tactile_resonance.fields import build, counted, numbers
+from tactile_resonance.configuration import shared_file
+from tactile_resonance.fields import build, counted, numbers, require
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.scan.level_set import LevelSet
+from tactile_resonance.scan.level_set import Boundary, LevelSet
 from tactile_resonance.scan.map_messages import (
     boundary_markers,
     cloud_message,
@@ -33,6 +34,7 @@ from tactile_resonance.scan.messages import header_message, to_cdr
 from tactile_resonance.scan.point_outcome import with_poles
 from tactile_resonance.scan.point_result import PointOutcome, PointResult, from_message
 from tactile_resonance.scan.pole_map import EllipseScale, GrowingMap, MapPoint, PoleMap, counts
+from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import read_classes
@@ -114,6 +116,12 @@ PARAMETERS = (
         "0: none on that side, both: no boundary.",
         read_only=True,
     ),
+    Parameter(
+        "adaptive_scene",
+        "",
+        "Scene with adaptive positions whose boundary is drawn as its scan finds it; empty: boundary_f0_hz.",
+        read_only=True,
+    ),
     Parameter("surface_cells", 40, "Cells along the longer side of the surface.", 4, 200),
 )
 
@@ -153,7 +161,9 @@ class PoleMapNode(ManagedNode):
             self._classes, self._nominal = read_classes(Path(classes_file))
         low, high = numbers(list(values(self, "boundary_f0_hz")[0]), "boundary_f0_hz", 2)
         ends = low or -math.inf, high or math.inf
-        self._wanted = build(LevelSet, "boundary_f0_hz", *ends) if low or high else None
+        wanted = build(LevelSet, "boundary_f0_hz", *ends) if low or high else None
+        (scene,) = values(self, "adaptive_scene")
+        self._boundary_of = _boundary_of(wanted, scene)
         self._grown = GrowingMap()
         self._left_out = 0
         kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
@@ -298,8 +308,8 @@ class PoleMapNode(ManagedNode):
 
         def markers() -> Any:
             beside: Sequence[Any] = ()
-            if self._wanted is not None:
-                beside = boundary_markers(pole_map, pole_map.boundary(self._wanted), header)
+            if self._boundary_of is not None:
+                beside = boundary_markers(pole_map, self._boundary_of(pole_map), header)
             return marker_message(pole_map, scale, probability, header, beside)
 
         makers: dict[str, Callable[[], Any]] = {
@@ -316,6 +326,20 @@ class PoleMapNode(ManagedNode):
         m_per_hz, m_per_damping = values(self, "ellipse_m_per_hz", "ellipse_m_per_damping")
         fitting = pole_map.ellipse_scale(probability)
         return EllipseScale(m_per_hz or fitting.m_per_hz, m_per_damping or fitting.m_per_damping)
+
+
+def _boundary_of(
+    wanted: LevelSet | None, scene: str
+) -> Callable[[PoleMap], Boundary | None] | None:
+    """What finds the boundary on a map; None where none is asked for."""
+    if not scene:
+        return None if wanted is None else (lambda pole_map: pole_map.boundary(wanted))
+    where = "adaptive_scene"
+    require(wanted is None, where, scene, "empty where boundary_f0_hz is given")
+    adaptive = read_scan_scene(shared_file(Path(scene), "config/scenes")).adaptive
+    if adaptive is None:
+        raise ValueError(f"{where}: got {scene}; accepted is a scene with adaptive positions")
+    return lambda pole_map: adaptive.boundary(pole_map.placed)
 
 
 def main() -> None:

@@ -201,6 +201,14 @@ class PoleMap:
         """Points with a pole and its covariance."""
         return tuple(p for p in self.estimated if np.all(np.isfinite(p.result.covariance)))
 
+    @property
+    def placed(self) -> list[PointResult]:
+        """Results of the points with a pole, at their places on the map."""
+        return [
+            replace(p.result, x_m=float(p.position_m[0]), y_m=float(p.position_m[1]))
+            for p in self.estimated
+        ]
+
     def krige(self) -> KrigedSurface | TiledSurface | None:
         """Natural frequency over x, y; None where too few points have a covariance."""
         points = self.with_ellipse
@@ -216,10 +224,7 @@ class PoleMap:
 
         Frequencies are those at the nominal contact where these are known.
         """
-        xy, f0_hz, std_hz = known_points(
-            replace(p.result, x_m=float(p.position_m[0]), y_m=float(p.position_m[1]))
-            for p in self.estimated
-        )
+        xy, f0_hz, std_hz = known_points(self.placed)
         if len(xy) < LEAST_POINTS or on_a_line(xy, SAME_PLACE_M):
             return None
         low, high = xy.min(axis=0) - self.spacing_m / 2, xy.max(axis=0) + self.spacing_m / 2

@@ -26,8 +26,9 @@ from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, initi
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
-from tactile_resonance.scan.point_result import PointKind, PointOutcome
+from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, shares
+from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -570,6 +571,46 @@ def test_a_boundary_that_is_wanted_is_drawn_where_it_is():
     assert np.ptp(places[:, 1]) > 0.004
     around = np.array([point.x for point in band.points])
     assert around.min() < 0.0015 < around.max()
+
+
+def test_the_boundary_of_an_adaptive_scan_is_that_of_its_report():
+    """Also where no point lies: over the whole region of the scene."""
+    path = share_path("config/scenes/demo.yaml")
+    arguments = [*OF_POLES, "-p", f"adaptive_scene:={path}"]
+    level_hz, results = read_scan_scene(path).adaptive.wanted.level_set.levels[0], []
+    with initialised(domain_id=free_domain_id(os.environ), args=arguments), Bench() as bench:
+        for k, y_m in enumerate((-0.002, 0.002)):
+            for j, x_m in enumerate(np.linspace(-0.006, 0.006, 5)):
+                f0_hz = level_hz + 1e3 * x_m
+                bench.send(poles(1 + 10 * k + j, x_m, f0_hz, place=(x_m, y_m, 0.0)))
+                results.append(
+                    PointResult(0, x_m=x_m, y_m=y_m, f0_hz=f0_hz, f0_std_hz=COVARIANCE[0, 0, 0] ** 0.5)
+                )
+        markers = bench.read(MarkerArray, "pole_map/markers")[0].markers
+    outline, _ = (marker for marker in markers if marker.ns == "boundary")
+    places = np.array([[point.x, point.y] for point in outline.points])
+    reported = np.concatenate(read_scan_scene(path).adaptive.boundary(results).outline_m)
+    assert {tuple(place) for place in places.round(9)} == {tuple(at) for at in reported.round(9)}
+    assert np.ptp(places[:, 1]) == pytest.approx(0.015, rel=0.05)
+    np.testing.assert_allclose(np.median(places[:, 0]), 0.0, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        (["adaptive_scene:=inclusion_scan.yaml"], "accepted is a scene with adaptive positions"),
+        (["adaptive_scene:=demo.yaml", "boundary_f0_hz:=[254.0, 0.0]"], "accepted is empty where"),
+    ],
+)
+def test_a_scene_without_a_boundary_of_its_own_is_refused(given, text):
+    arguments = [*OF_POLES, *(word for each in given for word in ("-p", each))]
+    with initialised(domain_id=free_domain_id(os.environ), args=arguments):
+        node = PoleMapNode()
+        node.trigger_configure()
+        assert node.state_name() == "unconfigured"
+        assert "adaptive_scene: got" in node.health._error
+        assert text in node.health._error
+        node.destroy_node()
 
 
 @pytest.mark.parametrize("given", ["[1.0]", "[255.0, 254.0]"])
