@@ -269,7 +269,7 @@ class Linearised:
     @property
     def residual(self) -> ComplexArray:
         """(M, K) weighted errors."""
-        return np.asarray(self.error / np.sqrt(self.variance))
+        return np.ascontiguousarray(self.error / np.sqrt(self.variance))
 
     @property
     def jacobian(self) -> FloatArray:
@@ -302,7 +302,7 @@ def least_squares(
         ``|A|`` that start values begin from; 1 when absent.
     """
     used = np.tile(np.isfinite(data.variance[0]), data.records)
-
+    all_used = bool(used.all())
     newest: list[tuple[bytes, Linearised]] = []
 
     def at(theta: FloatArray) -> Linearised:
@@ -315,7 +315,8 @@ def least_squares(
     def flat(values: npt.NDArray) -> npt.NDArray:
         """Real and imaginary parts of bins that are not left out."""
         columns = values.size // (2 * used.size)
-        return values.reshape(used.size, 2, columns)[used].reshape(-1, max(columns, 1))
+        rows = values.reshape(used.size, 2, columns)
+        return (rows if all_used else rows[used]).reshape(-1, max(columns, 1))
 
     with np.errstate(all="ignore"):
         if start is None:
@@ -323,15 +324,13 @@ def least_squares(
             if delay_phase is not None:
                 start = np.append(start, 0.0)
         converged, theta = False, start
-        begin = flat(at(start).residual.copy().view(float))
+        begin = flat(at(start).residual.view(float))
         if np.isfinite(begin).all() and begin.size >= start.size:
             try:
                 found = optimize.least_squares(
-                    lambda theta: np.nan_to_num(
-                        flat(at(theta).residual.copy().view(float))[:, 0], nan=1e150
-                    ),
+                    lambda theta: _finite(flat(at(theta).residual.view(float))[:, 0], 1e150),
                     start,
-                    lambda theta: np.nan_to_num(flat(at(theta).jacobian)),
+                    lambda theta: _finite(flat(at(theta).jacobian), 0.0),
                     method="lm",
                     x_scale="jac",
                     ftol=LEAST_SQUARES_TOLERANCE,
@@ -354,6 +353,11 @@ def least_squares(
             power = float(np.sum(np.abs(data.y[0][:, data.order]) ** 2 / data.variance[0]))
             converged = _at_minimum(rows, residual.view(float).ravel(), ROUNDING**2 * power)
     return DenseSolution(theta, jacobian, last.residual, turned, converged)
+
+
+def _finite(values: FloatArray, otherwise: float) -> FloatArray:
+    """Values with others in place of those that are not finite; themselves where all are."""
+    return values if np.isfinite(values).all() else np.nan_to_num(values, nan=otherwise)
 
 
 def _at_minimum(jacobian: FloatArray, residual: FloatArray, rounding: float) -> bool:
