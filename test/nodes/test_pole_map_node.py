@@ -598,11 +598,17 @@ def test_the_boundary_of_an_adaptive_scan_is_that_of_its_report():
 @pytest.mark.parametrize(
     ("given", "text"),
     [
+        (["adaptive_scene:=whole_map.yaml"], "accepted is a scene with adaptive positions"),
         (["adaptive_scene:=inclusion_scan.yaml"], "accepted is a scene with adaptive positions"),
         (["adaptive_scene:=demo.yaml", "boundary_f0_hz:=[254.0, 0.0]"], "accepted is empty where"),
     ],
 )
-def test_a_scene_without_a_boundary_of_its_own_is_refused(given, text):
+def test_a_scene_without_a_boundary_of_its_own_is_refused(given, text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = yaml.safe_load(share_path("config/scenes/demo.yaml").read_text())
+    del scene["positions"]["adaptive"]["boundary"]
+    scene["positions"]["adaptive"]["map"] = {"f0_std_hz": 0.5}
+    (tmp_path / "whole_map.yaml").write_text(yaml.safe_dump(scene, sort_keys=False))
     arguments = [*OF_POLES, *(word for each in given for word in ("-p", each))]
     with initialised(domain_id=free_domain_id(os.environ), args=arguments):
         node = PoleMapNode()
