@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray
 from tactile_resonance.frf.local_polynomial import kept_plan
+from tactile_resonance.frf.realisations import Agreement, holds_transient
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.spectra import (
     PeriodicSpectra,
@@ -27,9 +28,6 @@ METHODS = ("local polynomial", "average")
 
 WEAK_INPUT_DB = 10.0
 """Input signal-to-noise ratio of a mean spectrum below which Y/U is biased [dB]."""
-
-# Chance alone makes realisations of one period look like a transient once in ten thousand times.
-TRANSIENT_SCORE = 3.7
 
 
 def frf_of_record(
@@ -189,11 +187,12 @@ def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
     g_each = ratio(each)  # (..., M, F)
     g = g_each.mean(axis=-2)
     variance_total = np.var(g_each, axis=-2, ddof=1) / realisations
-    variance_noise = None
+    variance_noise = given = None
     if spectra.covariance is not None:
         noise = spectra.covariance.mean(axis=-4) / realisations  # (..., 2, 2, F)
+        given = conditional_variance(noise)
         variance_noise = error_variance(g, noise) / np.mean(power(each[..., 1, :]), axis=-2)
-    status, message = _robust_status(each, spectra.covariance, g)
+    status, message = _robust_status(each, spectra.covariance, g, g_each)
     return FRF(
         frequency_hz=spectra.frequency_hz(sample_rate_hz),
         g=g,
@@ -201,6 +200,7 @@ def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
         variance_total=variance_total,
         noise_dof=realisations * spectra.noise_dof,
         total_dof=realisations - 1,
+        sensor_variance_given_actuator=given,
         periods=spectra.periods,
         realisations=realisations,
         method=f"robust method, {spectra.method}",
@@ -241,44 +241,21 @@ def response_status(
 
 
 def _robust_status(
-    each: ComplexArray, covariance: ComplexArray | None, g: ComplexArray
+    each: ComplexArray, covariance: ComplexArray | None, g: ComplexArray, g_each: ComplexArray
 ) -> tuple[FrfStatus, str]:
-    if covariance is not None:
-        return response_status(each, covariance)
-    if transient_score(each, g) > TRANSIENT_SCORE:
+    if covariance is None and holds_transient(each, g):
         return (
-            FrfStatus.SUSPECT,
+            FrfStatus.MODEL_ERROR,
             "a transient: what the realisations differ by is alike on neighbouring lines, which noise "
             "and distortion are not; record two periods or more of each, or wait before the record",
         )
+    remarks = [text for text in Agreement.of(g_each.reshape(-1, *g_each.shape[-2:])).remarks() if text]
+    if remarks:
+        return FrfStatus.MODEL_ERROR, remarks[0]
+    if covariance is not None:
+        return response_status(each, covariance)
     return (
         FrfStatus.OK,
         "one period per realisation: noise and distortion are not distinguished, the variance over "
         "realisations holds both",
     )
-
-
-def transient_score(each: ComplexArray, g: ComplexArray) -> float:
-    """How alike neighbouring lines of ``Y_m - G U_m`` are, in standard deviations of chance.
-
-    Noise and stochastic distortion are independent from line to line, the spectrum of a transient is
-    smooth. Every product of neighbours has mean zero then and brings its own variance, so that lines
-    may differ in noise.
-
-    Parameters
-    ----------
-    each : (..., M, 2, F) complex
-        Spectra [Y; U] of the realisations.
-    g : (..., F) complex
-        Mean response.
-
-    Returns
-    -------
-    float
-        The largest over the leading axes; NaN for fewer than two lines.
-    """
-    error = each[..., 0, :] - g[..., None, :] * each[..., 1, :]  # (..., M, F)
-    product = np.real(error[..., 1:] * error[..., :-1].conj())
-    with np.errstate(divide="ignore", invalid="ignore"):
-        score = product.sum(axis=(-2, -1)) / np.sqrt(np.sum(product**2, axis=(-2, -1)))
-    return float(np.max(score))

@@ -16,7 +16,7 @@ import scipy.fft
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.tones import MAINS_HZ, ROUNDING
 
@@ -111,11 +111,10 @@ class FaultReport:
         """The FRF with what was found in its message, and SUSPECT where a fault spoils it."""
         if not self.faults:
             return frf
-        status = frf.status
-        if self.suspect and status is not FrfStatus.FAILED:
-            status = FrfStatus.SUSPECT
+        if self.suspect:
+            return frf.suspected(self.message)
         message = "; ".join(filter(None, [frf.message, self.message]))
-        return replace(frf, status=status, message=message)
+        return replace(frf, message=message)
 
 
 def find_faults(

@@ -134,11 +134,7 @@ class MeasurementFrf:
         if frf.g.size and np.isfinite(delay_s) and delay_s != 0:
             frf = correct_skew(replace(frf, bins=None, further_bins=()), delay_s)
         frf = FaultReport(tuple(self._faults.values())).marked(frf)
-        if not self._notes:
-            return frf
-        status = FrfStatus.FAILED if frf.status is FrfStatus.FAILED else FrfStatus.SUSPECT
-        message = "; ".join(filter(None, [frf.message, *self._notes]))
-        return replace(frf, status=status, message=message)
+        return frf.suspected("; ".join(self._notes)) if self._notes else frf
 
     def origin(self) -> Origin:
         """Where the FRF comes from: middle of the acquisition, last pose, force over all blocks.

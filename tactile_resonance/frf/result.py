@@ -43,6 +43,7 @@ class FrfStatus(Enum):
     OK = "ok"
     NO_COVARIANCE = "no covariance"
     SUSPECT = "suspect"
+    MODEL_ERROR = "model error"
     FAILED = "failed"
 
 
@@ -69,7 +70,7 @@ class FRF:
         realisation.
     sensor_variance_given_actuator : (..., F) float or None
         Noise variance of the mean spectrum Y that is not noise of U, which the generator makes:
-        ``C_YY - |C_YU|^2 / C_UU`` [V^2]. Of one realisation.
+        ``C_YY - |C_YU|^2 / C_UU`` [V^2]. Of several realisations that of the mean of all.
     bins : BandBins or None
         All bins of a band of the records behind G, where asked for: of as many realisations.
     further_bins : tuple of BandBins
@@ -125,6 +126,15 @@ class FRF:
         if self.variance_noise is None or self.variance_total is None:
             return None
         return self.realisations * (self.variance_total - self.variance_noise)
+
+    def suspected(self, message: str) -> FRF:
+        """With a message added, and SUSPECT unless it is worse."""
+        graver = self.status in (FrfStatus.MODEL_ERROR, FrfStatus.FAILED)
+        return replace(
+            self,
+            status=self.status if graver else FrfStatus.SUSPECT,
+            message="; ".join(filter(None, [self.message, message])),
+        )
 
     def band(self, low_hz: float, high_hz: float) -> FRF:
         """The lines from `low_hz` to `high_hz`, ends included."""

@@ -83,8 +83,10 @@ def poles_of_frf(
         if method == "auto" and frf.bins is not None:
             poles = poles.noting(f"from the FRF: {reason}")
         return poles
-    notes = [frf.message] if frf.status is not FrfStatus.OK else []
-    poles = identify_poles_from_bins(frf.bins, band_hz, structure, notes=notes)
+    poles = identify_poles_from_bins(frf.bins, band_hz, structure)
+    said = poles.status is PolesStatus.MODEL_ERROR and frf.status is FrfStatus.MODEL_ERROR
+    if frf.status is not FrfStatus.OK and not said:
+        poles = poles.noting(frf.message)
     return second_attempt(poles, frf, band_hz, structure)
 
 

@@ -35,9 +35,9 @@ FEWEST_BINS = 16
 # A record without a transient is suspected once in ten thousand times.
 TRANSIENT_FALSE_ALARM = 1e-4
 FEWEST_NEAR = 3
-# Deviation in bins of a mode narrower than one, beside what the variance shows: a transient that is left
+# Deviation in bins of a mode of less than so many, beside what the variance shows: a transient that is left
 # changes its shape, by .28 bins of half width at most.
-UNRESOLVED = 0.25
+NARROW, UNRESOLVED = 2.0, 0.25
 
 
 def identify_frf(
@@ -304,7 +304,7 @@ def _nothing(plan: LinesPlan, used: IntArray) -> Judged:
 
 
 def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
-    """The poles; status MODEL_ERROR where a transient is left in the FRF they are from.
+    """The poles; status MODEL_ERROR where a transient is left in the FRF they are from, or it has that status.
 
     Parameters
     ----------
@@ -319,8 +319,9 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
     noise of the output, and is largest beside the mode. So the variance of the output given the input
     (``C_YY - |C_YU|^2 / C_UU``, which noise of the generator does not enter) of the lines within half
     the mode's width, three at least and a quarter of the band at most, is compared with that of the
-    farther half of the band by an F-test. It needs `FRF.sensor_variance_given_actuator`, hence one
-    realisation; without, half widths below `FEWEST_BINS` are mentioned.
+    farther half of the band by an F-test. It needs `FRF.sensor_variance_given_actuator`, hence two
+    periods; of one period, realisations show a transient by what they differ by (status MODEL_ERROR of the
+    FRF, see `frf.realisations`). Where none is detected half widths below `FEWEST_BINS` are mentioned.
 
     Monte Carlo, 30 records a cell of a mode at 250 Hz in 200-300 Hz, lines 2.5 Hz apart, order 2, 2 to 8
     periods, damping ratio .005 to .1, 20 to 80 dB: from rest, mean square errors of f0 over the
@@ -343,6 +344,8 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
     `UNRESOLVED`; without, damping ratios were off by up to 16 deviations. In steady state the ratio was
     .5 to 2 throughout. The test found every cell with a ratio above 3, and none in steady state.
     """
+    if frf.status is FrfStatus.MODEL_ERROR:
+        return _doubted(frf, poles)
     if "local polynomial" not in frf.method or frf.periods < 2 or poles.f0_hz.size == 0:
         return poles
     left = max(_beside(frf, poles, k) for k in range(poles.f0_hz.size))
@@ -352,19 +355,24 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
             "local polynomials do not follow its transient, and the poles have little precision; use "
             "the joint method, more periods, or drop the first"
         )
-        judged = poles.status in (PolesStatus.OK, PolesStatus.NO_COVARIANCE)
-        total = poles.covariance if poles.total_covariance is None else poles.total_covariance
-        if total is not None:
-            std = np.where(_half_width(frf, poles) < 1, UNRESOLVED * 2 * np.pi * _bin_hz(frf), 0.0)
-            total = total + in_any_direction(std, poles.poles_rad_s)
-        poles = replace(
-            poles,
-            status=PolesStatus.MODEL_ERROR if judged else poles.status,
-            total_covariance=total,
-        )
+        poles = _doubted(frf, poles)
     else:
         note = _light_damping(frf, poles)
     return poles.noting(note)
+
+
+def _doubted(frf: FRF, poles: Poles) -> Poles:
+    """With status MODEL_ERROR unless it is worse, and what a narrow mode is off by in the total covariance."""
+    judged = poles.status in (PolesStatus.OK, PolesStatus.NO_COVARIANCE)
+    total = poles.covariance if poles.total_covariance is None else poles.total_covariance
+    if total is not None:
+        std = np.where(_half_width(frf, poles) < NARROW, UNRESOLVED * 2 * np.pi * _bin_hz(frf), 0.0)
+        total = total + in_any_direction(std, poles.poles_rad_s)
+    return replace(
+        poles,
+        status=PolesStatus.MODEL_ERROR if judged else poles.status,
+        total_covariance=total,
+    )
 
 
 def _beside(frf: FRF, poles: Poles, mode: int) -> float:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance.frf.realisations import Agreement
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Solution, minimise, refit_failed
 from tactile_resonance.poles.joint_noise import TINY, rules_between, with_noise
@@ -117,6 +118,15 @@ class _Round:
     def response(self) -> ComplexArray:
         """(batch, K_e) on excited lines."""
         return self.plan.problem.response(self.solution.theta[:, 0])
+
+    @property
+    def responses(self) -> ComplexArray:
+        """(batch, M, K_e) of each realisation on excited lines, without its transient; NaN without input."""
+        problem, driven = self.plan.problem, slice(self.data.undriven, None)
+        alpha, _, gamma = problem.split(self.solution.theta)
+        transient = (gamma @ problem.transient[driven].T) / (alpha @ problem.denominator[driven].T)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray((self.data.y_driven - transient) / self.data.u_driven)
 
     @cached_property
     def variance(self) -> FloatArray:
@@ -404,12 +414,16 @@ def _each_by_itself(fit: Judged, total: FloatArray, first: _Round) -> Judged:
     for k in (0, 1):
         systematic[..., k, k] += weight[:, None] * np.maximum(np.nan_to_num(more[..., k]), 0.0)
     odd, remark = spread.remarks()
+    agreement = Agreement.of(first.responses)
+    wrong, unknown = agreement.contradiction, agreement.opposed.any(axis=(1, 2), keepdims=True)
+    if np.any(unknown):  # what is left of their mean is of no system
+        covariance, total = (np.where(unknown, np.nan, one) for one in (covariance, total))
     return replace(
         fit,
         theta=changed,
         covariance=covariance,
         total=total,
-        suspect=fit.suspect | odd,
+        suspect=fit.suspect | odd | wrong,
         systematic=systematic,
-        remark=remark,
+        remark=np.where(wrong, agreement.remarks(), remark),
     )

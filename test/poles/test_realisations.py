@@ -99,6 +99,30 @@ def test_distortion_is_told_from_noise_and_from_model_error(realisations, period
     assert stats.binom.cdf(coverage * RUNS, RUNS, 0.94) > 0.0005
 
 
+@pytest.mark.parametrize(("realisations", "periods"), [(2, 2), (3, 2), (4, 2), (6, 4), (5, 1)])
+@pytest.mark.parametrize("factor", [-1.0, 1.5, 0.0])
+def test_records_of_different_systems_are_no_certain_result(realisations, periods, factor):
+    """Where the polarity of one differs, what is left of the mean is of neither: off by up to 32 deviations."""
+    if factor == 0 and realisations == 2:
+        pytest.skip("without a third record nothing tells which of two holds a response")
+    all_plants = plants(0.02, 40.0, periods, realisations)
+    u, y = spectra(all_plants, np.random.default_rng(3), 50)
+    good = plan_of(periods).from_bins(u, y)
+    assert np.mean(good.has_status(PolesStatus.OK)) > 0.9
+    error = all_plants[1].noisy(np.random.default_rng(4), 50, all_plants[1].bins())
+    y[:, 1] = factor * y[:, 1] if factor else error[1] - np.mean(error[1], axis=0)
+    result = plan_of(periods).from_bins(u, y)
+    wrong = ~result.has_status(PolesStatus.OK)  # a model error, or even an unstable pole
+    assert np.mean(wrong) > 0.9
+    assert all("realisation" in remark for remark in result.remark[wrong])
+    if factor < 0:
+        assert np.isnan(result.total_covariance[wrong]).all()
+        assert np.isnan(result.covariance[wrong]).all()
+    else:
+        errors, total = errors_of(result, 0.02)[wrong], result.total_covariance[wrong, 0]
+        assert judge(errors, total, np.eye(2))[1] > 0.9
+
+
 NOT_LINEAR = (RATE_HZ, SAMPLES, 2, LINES, (200.0, 300.0), BARE)
 
 

@@ -31,9 +31,10 @@ def record(seed, periods, damping_ratio, snr_db, *, settled):
     return u.reshape(played, SAMPLES)[kept], y.reshape(played, SAMPLES)[kept]
 
 
-def poles_of(*arguments, settled):
-    u, y = record(*arguments, settled=settled)
-    frf = frf_of_record(Spectrum.of(u[None], y[None]), sample_rate_hz=RATE_HZ, harmonics=LINES)
+def poles_of(seed, *arguments, settled, realisations=1):
+    records = [record(seed + 1000 * m, *arguments, settled=settled) for m in range(realisations)]
+    u, y = (np.stack(channel) for channel in zip(*records, strict=True))
+    frf = frf_of_record(Spectrum.of(u, y), sample_rate_hz=RATE_HZ, harmonics=LINES)
     return identify_frf(frf, (200.0, 300.0), ModelStructure(2, 2))
 
 
@@ -68,3 +69,20 @@ def test_total_ellipses_hold_modes_narrower_than_a_bin(periods, half_width_bins,
 def test_a_transient_that_they_follow_is_none_of_their_faults():
     for seed in range(10):
         assert poles_of(seed, 8, 0.05, 40, settled=False).status is PolesStatus.OK
+
+
+@pytest.mark.parametrize("half_width_bins", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize(("realisations", "periods"), [(6, 1), (10, 1), (50, 1), (2, 2), (10, 2), (10, 4)])
+def test_several_realisations_from_rest(realisations, periods, half_width_bins):
+    """Damping ratios were off by up to sixteen deviations, with status ok."""
+    damping_ratio = half_width_bins * RATE_HZ / SAMPLES / periods / 250
+    for seed in range(3):
+        case = (seed, periods, damping_ratio, 60)
+        poles = poles_of(*case, settled=False, realisations=realisations)
+        assert poles.status is PolesStatus.MODEL_ERROR
+        assert "transient" in poles.message
+        mode = poles.main
+        assert (np.abs(mode.estimate - [250, damping_ratio]) < 3 * mode.std).all()
+        if 12 * half_width_bins / periods > 1.5:  # nothing is left after twelve periods
+            settled = poles_of(*case, settled=True, realisations=realisations)
+            assert settled.status is PolesStatus.OK

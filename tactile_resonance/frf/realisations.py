@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the records of several realisations are of one system, in steady state.
+
+The mean of the responses of records that contradict each other is the response of none of them: one was
+recorded with the polarity or the gain changed, without the sensor, or beside the wrong actuator signal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance.frf.spectra import power
+
+# By chance once in so many sets of records.
+FALSE_ALARM = 1e-4
+# Lines above the so-many-th largest count alike: a tone is large on one.
+LINES_ALIKE = 5
+# Resonators that are slightly nonlinear differ by less.
+MOST_PHASE_RAD = np.pi / 4
+MOST_GAIN = 1.25
+DEVIATIONS = 5.0
+# Squared coherence from which a ratio of powers is one of gains, and that of two that are alike.
+FOR_GAIN, ALIKE = 0.8, 0.5
+# Lines over which neighbours are compared: a transient is at the modes.
+WINDOWS = (8, 32, 128)
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How realisations compare with each other.
+
+    Attributes
+    ----------
+    gain : (batch, M, M) complex
+        ``gain[m, n]``: response of m in units of that of n; 1 where they agree.
+    opposed : (batch, M, M) bool
+        Coherent, but of another phase.
+    unequal : (batch, M, M) bool
+        Coherent, but of another gain.
+    apart : (batch, M) bool
+        Without coherence with any other realisation, two of which are coherent.
+    """
+
+    gain: ComplexArray
+    opposed: BoolArray
+    unequal: BoolArray
+    apart: BoolArray
+
+    @classmethod
+    def of(cls, response: ComplexArray) -> Agreement:
+        """Of responses.
+
+        Parameters
+        ----------
+        response : (batch, M, F) complex
+            Of each realisation; lines without input, NaN, count as none.
+
+        Notes
+        -----
+        Noise and stochastic distortion of two realisations are independent, so that they lower the
+        coherence ``|H_mn|^2 / (H_mm H_nn)``, ``H_mn = sum G_m conj G_n``, but turn no phase.
+        """
+        response = np.where(np.isfinite(response), response, 0)
+        size = power(response).sum(axis=1)  # (batch, F)
+        few = min(LINES_ALIKE, size.shape[-1])
+        weight = 1 / np.maximum(size + np.partition(size, -few, axis=-1)[:, [-few]], np.finfo(float).tiny)
+        share = weight * size
+        lines = np.sum(share, axis=-1) ** 2 / np.maximum(np.sum(share**2, axis=-1), np.finfo(float).tiny)
+        lines = np.maximum(lines, 2.0)[:, None, None]
+        h = (response * weight[:, None]) @ response.conj().swapaxes(1, 2)  # (batch, M, M)
+        diagonal = np.einsum("bmm->bm", h).real
+        diagonal = np.where(diagonal > 0, diagonal, np.nan)
+        coherence = power(h) / (diagonal[:, :, None] * diagonal[:, None, :])
+        records = response.shape[1]
+        pairs = max(records * (records - 1) // 2, 1)
+        coherent = coherence > 1 - (FALSE_ALARM / pairs) ** (1 / (lines - 1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            deviation = np.sqrt((1 - np.minimum(coherence, 1)) / (2 * lines * coherence))
+            gain = h / np.abs(h) * np.sqrt(diagonal[:, :, None] / diagonal[:, None, :])
+        opposed = coherent & (np.abs(np.angle(h)) > MOST_PHASE_RAD + DEVIATIONS * deviation)
+        high = coherent & (coherence > FOR_GAIN)
+        unequal = high & (np.abs(np.log(np.abs(gain))) > np.log(MOST_GAIN) + DEVIATIONS * deviation)
+        return cls(gain, opposed, unequal, _apart(h, coherence, coherent, lines))
+
+    @property
+    def contradiction(self) -> BoolArray:
+        """(batch,) whether the records are not of one system."""
+        return np.asarray(self._pairs.any(axis=(1, 2)) | self.apart.any(axis=-1))
+
+    def remarks(self) -> npt.NDArray[np.object_]:
+        """(batch,) what contradicts, for people; empty where nothing does."""
+        wrong = self.contradiction
+        remarks = np.full(wrong.size, "", object)
+        for k in np.flatnonzero(wrong):
+            remarks[k] = self._remark(int(k))
+        return remarks
+
+    @property
+    def _pairs(self) -> BoolArray:
+        return self.opposed | self.unequal
+
+    def _remark(self, k: int) -> str:
+        pairs, apart = self._pairs[k], np.flatnonzero(self.apart[k])
+        records = np.arange(len(pairs))
+        if apart.size:
+            names = " and ".join(str(m + 1) for m in apart)
+            return f"the response of realisation {names} has nothing in common with those of the others"
+        for m in records if records.size > 2 else ():
+            rest = records[records != m]
+            if not pairs[np.ix_(rest, rest)].any():
+                return f"realisation {m + 1} responds with {_gain(self.gain[k, m, rest].mean())} of the others"
+        m, n = np.argwhere(pairs)[0]
+        return f"realisation {n + 1} responds with {_gain(self.gain[k, n, m])} of realisation {m + 1}"
+
+
+def _apart(
+    h: ComplexArray, coherence: FloatArray, coherent: BoolArray, lines: FloatArray
+) -> BoolArray:
+    """(batch, M) see `Agreement`: with neither of the two that are most alike, beyond what noise may hide."""
+    batch, records, _ = h.shape
+    others = coherent & ~np.eye(records, dtype=bool)
+    alike = np.where(others, coherence, 0.0).reshape(batch, records**2)
+    rows, place = np.arange(batch), alike.argmax(axis=-1)
+    two = np.stack(np.divmod(place, records), axis=-1)  # (batch, 2)
+    common = np.abs(h[rows, two[:, 0], two[:, 1]])[:, None]
+    size = np.einsum("bmm->bm", h).real
+    lacks = np.ones((batch, records), bool)
+    for n in two.T:
+        noise = np.sqrt(size * size[rows, n][:, None] / lines[..., 0])
+        lacks &= common - np.abs(h[rows, :, n]) > DEVIATIONS * noise
+    return lacks & ~others.any(axis=-1) & (alike[rows, place] > ALIKE)[:, None]
+
+
+def _gain(gain: complex) -> str:
+    turned = round(np.degrees(np.angle(gain)))
+    return f"{abs(gain):.3g} times the gain" + (f" and {turned} degrees from the phase" if turned else "")
+
+
+def holds_transient(each: ComplexArray, g: ComplexArray) -> bool:
+    """Whether neighbouring lines of ``Y_m - G U_m`` are more alike than chance makes them.
+
+    Noise and stochastic distortion are independent from line to line, the spectrum of a transient is
+    smooth. Over M realisations the real part of the correlation of neighbours has mean 0 and variance
+    ``1 / (2 (M - 1))`` then, whatever the noise of each line.
+
+    Parameters
+    ----------
+    each : (..., M, 2, F) complex
+        Spectra [Y; U] of the realisations.
+    g : (..., F) complex
+        Mean response.
+    """
+    error = each[..., 0, :] - g[..., None, :] * each[..., 1, :]  # (..., M, F)
+    size = np.sqrt(power(error).sum(axis=-2))
+    product = np.real(error[..., 1:] * error[..., :-1].conj()).sum(axis=-2)  # (..., F - 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = np.nan_to_num(product / (size[..., 1:] * size[..., :-1]))
+    count, degrees = correlation.shape[-1], 2 * (error.shape[-2] - 1)
+    scores, tests = [], 0
+    for window in sorted({min(window, count) for window in (*WINDOWS, count) if count}):
+        sums = np.cumsum(np.insert(correlation, 0, 0.0, axis=-1), axis=-1)
+        sums = sums[..., window:] - sums[..., :-window]
+        scores.append(np.max(sums) * np.sqrt(degrees / window))
+        tests += sums.size
+    return bool(scores) and max(scores) > -special.ndtri(FALSE_ALARM / tests)
+
