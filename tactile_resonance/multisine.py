@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.fields import number, numbers, require, whole
+from tactile_resonance.fields import number, numbers, require, require_kind, whole
 from tactile_resonance.poles.structure import PoleBand
 
 
@@ -191,8 +191,7 @@ def mains_lines(
     ValueError
         If a frequency has harmonics so near each other that no line would be left between them.
     """
-    if not (isinstance(lines_beside, int) and lines_beside >= 0):
-        raise ValueError(f"lines_beside: {lines_beside!r}, expected a whole number, at least 0")
+    lines_beside = whole(lines_beside, "lines_beside")
     width_hz = (2 * lines_beside + 1) * spacing_hz
     found = np.zeros(np.shape(frequency_hz), bool)
     for mains in mains_hz:
@@ -302,6 +301,8 @@ def design_multisine(
             for low, high in ends
         ]
     )
+    apart = bool(np.all(np.diff(harmonics) > 0))
+    require(apart, "band_hz", band_hz, "bands that are ascending and share no line")
     frequency_hz = np.asarray(harmonics * resolution_hz, float)
     hum = mains_lines(frequency_hz, resolution_hz, numbers(mains_hz, "mains_hz"), lines_beside)
     if hum.all():
@@ -319,6 +320,12 @@ def design_multisine(
             raise ValueError(
                 f"relative_amplitude: shape {shape.shape}, expected {harmonics.shape} positive values"
             )
+        shape = shape / shape.max()  # squares of what is very large or small would not be finite, or 0
+    require_kind(sweep, "sweep", bool)
+    require_kind(label, "label", str)
+    require_kind(bands, "bands", tuple)
+    for each in bands:
+        require_kind(each, "bands", PoleBand)
     realisations = whole(realisations, "realisations", 1)
     accepted = "1 with sweep: its phases are the same in each"
     require(realisations == 1 or not sweep, "realisations", realisations, accepted)
@@ -337,8 +344,8 @@ def design_multisine(
         grid=grid,
         seed=seed,
         random_phases=not sweep,
-        measurement_id=measurement_id,
-        excitation_id=excitation_id,
+        measurement_id=whole(measurement_id, "measurement_id"),
+        excitation_id=whole(excitation_id, "excitation_id"),
         label=label,
         bands=bands,
     )

@@ -48,6 +48,9 @@ def test_shaped_amplitude_keeps_its_shape():
     excitation = design_multisine(relative_amplitude=shape, level_v=1.0)
     np.testing.assert_allclose(excitation.amplitude_v / excitation.amplitude_v[0], shape)
     assert excitation.level_v == pytest.approx(1.0)
+    for factor in (1e-200, 1e200):
+        same = design_multisine(relative_amplitude=factor * shape, level_v=1.0)
+        np.testing.assert_allclose(same.amplitude_v, excitation.amplitude_v)
 
 
 def test_odd_random_grid_leaves_out_one_of_each_block():
@@ -145,7 +148,13 @@ def test_crest_factor_of_random_phases_is_near_four():
         ({"mains_hz": (50.0, 5.0)}, "mains_hz: 5, expected above 7.5 Hz"),
         ({"mains_hz": (float("nan"),)}, "mains_hz.0.: got nan; accepted is a finite number"),
         ({"mains_hz": (50.0,), "band_hz": (248, 252)}, "mains_hz: .* leave no line"),
-        ({"lines_beside": -1}, "lines_beside: -1"),
+        ({"lines_beside": -1}, "lines_beside: got -1; accepted is a whole number, at least 0"),
+        ({"band_hz": [(200, 300), (100, 150)]}, "band_hz: .* ascending and share no line"),
+        ({"band_hz": [(200, 300), (300, 400)]}, "band_hz: .* ascending and share no line"),
+        ({"sweep": "no"}, "sweep: got a str; accepted is a bool"),
+        ({"label": 5}, "label: got a int; accepted is a str"),
+        ({"bands": ((200.0, 300.0),)}, "bands: got a tuple; accepted is a PoleBand"),
+        ({"measurement_id": -1}, "measurement_id: got -1; accepted is a whole number"),
     ],
 )
 def test_bad_input_names_the_field(change, message):

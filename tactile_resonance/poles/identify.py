@@ -22,7 +22,7 @@ from tactile_resonance.poles.lines import (
 from tactile_resonance.poles.lines_fit import LinesPlan
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, systematic_of
 from tactile_resonance.poles.modes import in_any_direction
-from tactile_resonance.poles.noise_level import KINDS
+from tactile_resonance.poles.noise_level import KINDS, student_variance
 from tactile_resonance.poles.outliers import poles_without_tones
 from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
@@ -253,10 +253,11 @@ def _judged(
     kind = known.kind
     if not level_known.all():
         # the residuals are all there is: they hold noise, distortion and model error together
-        level = fit.cost / np.maximum(used - parameters / 2, 0.5)
+        dof = np.maximum(used - parameters / 2, 0.5)
+        level = fit.cost / dof
         known_here, unknown = level_known[:, None, None], np.full_like(covariance, np.nan)
         covariance = np.where(known_here, covariance, unknown)
-        from_residuals = plain * level[:, None, None]
+        from_residuals = plain * (level * student_variance(dof))[:, None, None]
         total = np.where(known_here, unknown if total is None else total, from_residuals)
         # what rounding leaves of exact data says nothing
         suspect &= level_known | (level > ROUNDED)

@@ -187,7 +187,8 @@ class Poles:
         nothing, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
         if not self.f0_hz.size:
             return MainMode(nothing, unknown, unknown, complex("nan+nanj"), nothing, nothing)
-        k = int(np.argmax(np.abs(self.residues) / np.abs(self.poles_rad_s.real)))
+        with np.errstate(divide="ignore"):  # a mode without damping
+            k = int(np.argmax(np.abs(self.residues) / np.abs(self.poles_rad_s.real)))
         drift, drift_std = nothing, nothing
         f0_drift, damping_drift = self.f0_drift_hz_per_s, self.damping_drift_per_s
         if f0_drift is not None and damping_drift is not None and self.drift_covariance is not None:

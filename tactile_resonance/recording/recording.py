@@ -144,6 +144,8 @@ def make_recording(
 
 
 def _as_samples(values: npt.ArrayLike, name: str) -> npt.NDArray[np.floating]:
+    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iuf":
+        values = np.ma.filled(values.astype(float), np.nan)  # samples that are masked are missing
     try:
         array = np.asarray(values)
     except ValueError:  # rows of different length
@@ -264,6 +266,8 @@ def read_recording(
         present = isinstance(name, str) and name in fields
         held = cut(", ".join(sorted(names)))  # names may be damaged too
         require(present, option, name, f"an array of numbers in {path.name}, which holds {held}")
+    for name in sorted({*_FIELDS}.intersection(names) - fields.keys()):
+        raise ValueError(f"{name}: no numbers in {path.name}, expected numbers, or no such field")
     if sample_rate_hz is None:
         sample_rate_hz = _sample_rate(fields, path)
     if samples_per_period is None and "samples_per_period" in fields:
@@ -290,7 +294,8 @@ def _sample_rate(fields: Mapping[str, np.ndarray], path: Path) -> float:
         time_s = np.ravel(fields["time_s"])
         step = np.diff(time_s)
         if step.size == 0 or not np.all(np.abs(step - step.mean()) < 0.01 * step.mean()):
-            raise ValueError("time_s: not evenly spaced, expected one sample rate")
+            steps = f"steps of {step.min():.6g} to {step.max():.6g} s" if step.size else "one sample"
+            raise ValueError(f"time_s: {steps}, expected steps that are alike within 1 %")
         return float(1 / step.mean())
     raise ValueError(f"sample_rate_hz: missing in {path.name}, expected there or given")
 

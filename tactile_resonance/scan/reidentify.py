@@ -124,7 +124,8 @@ def reidentify(
     Raises
     ------
     ValueError
-        If a folder is no run, or the model does not suit a band; before any point is read.
+        If a folder is no run, or the model does not suit a band, before any point is read; or if there is
+        no point.
     OSError
         If a file cannot be read or written, or a process was ended from outside.
     """
@@ -147,6 +148,8 @@ def reidentify(
             for kind, _ in kept[-1].kinds:
                 _plan(kind, band, model)  # raises what does not suit
         total, done = sum(of_run.count for of_run in kept), 0
+        if total == 0:
+            raise ValueError(f"no point to identify: {'; '.join(left_out[:3]) or 'none is finished'}")
         jobs = (
             (dtype, *job)
             for k, run in enumerate(kept)

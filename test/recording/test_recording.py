@@ -65,6 +65,7 @@ def test_single_precision_is_not_copied():
         ({"y": Y[:-1]}, r"y: shape \(23,\), expected that of u"),
         ({"y": np.where(np.arange(24) == 3, np.nan, Y)}, "y: 1 samples are NaN or infinite"),
         ({"u": np.where(np.arange(24) == 3, np.inf, U)}, "u: 1 samples are NaN or infinite"),
+        ({"y": np.ma.masked_greater(Y, 0.5)}, "y: .* samples are NaN or infinite"),
         ({"u": np.array(["a"] * 24)}, "u: values of type"),
         ({"u": U * 1j}, "u: values of type complex"),
         ({"excited_harmonics": [0, 1]}, "excited_harmonics"),
@@ -142,6 +143,22 @@ def test_files_that_are_no_record(tmp_path, fields):
     np.savez(tmp_path / "objects.npz", u=np.array([{}]), y=Y)
     with pytest.raises(ValueError, match="no .npz record"):
         read_recording(tmp_path / "objects.npz")
+
+
+def test_fields_that_hold_text_are_named(tmp_path, fields):
+    for name in ("sample_rate_hz", "samples_per_period", "excited_harmonics"):
+        for suffix, save in ((".npz", np.savez), (".mat", lambda path, **of: scipy.io.savemat(path, of))):
+            path = tmp_path / f"a{suffix}"
+            save(path, **(fields | {name: "10"}))
+            with pytest.raises(ValueError, match=f"{name}: no numbers in a{suffix}, expected numbers"):
+                read_recording(path)
+
+
+def test_times_that_are_not_even_are_named(tmp_path):
+    table = np.column_stack([np.delete(np.arange(25), 3) / 10.0, U, Y])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="time_s,u,y", comments="")
+    with pytest.raises(ValueError, match="time_s: steps of 0.1 to 0.2 s, expected steps that are alike"):
+        read_recording(tmp_path / "a.csv")
 
 
 def test_missing_fields_are_named_with_those_present(tmp_path, fields):

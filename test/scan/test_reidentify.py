@@ -201,6 +201,8 @@ def test_what_it_refuses(runs, tmp_path, capsys):
         "--band: got [300.0, 200.0]": [str(runs[0]), "--band", "300", "200"],
         "order: 0": [str(runs[0]), "--order", "0"],
         "holds 4 excited lines": [str(runs[0]), "--band", "249", "259"],
+        "RUN: got": [str(runs[0]), str(runs[0]), "--output", str(tmp_path / "twice")],
+        "no point to identify: ": [str(runs[0]), "--band", "1", "2", "--output", str(tmp_path / "none")],
     }
     for text, arguments in cases.items():
         assert main(["reidentify", *arguments]) == 1
