@@ -119,19 +119,21 @@ def run(output: Path, quick: bool, row: str = "") -> str:
 
 
 def session(names: Sequence[str]) -> Iterator[Row]:
-    """These rows of nodes and messages; after one that does not end, nodes are started anew."""
+    """These rows of nodes and messages; after one that does not end, or is wrong, nodes are started anew."""
     rows, left = session_rows(), [*names]
     while left:
         domain = free_domain_id({})
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        name = left.pop(0)
         try:
             with FaultyScan(Path(mkdtemp()), f"127.0.92.{domain + 1}") as scan:
-                yield rows[name](scan)
-                while left:
-                    name = left.pop(0)
-                    yield rows[name](scan)
+                sound = True
+                while left and sound:
+                    row = rows[left[0]](scan)
+                    del left[0]
+                    sound = not row.wrong
+                    yield row
         except (AssertionError, RuntimeError) as error:
+            name = left.pop(0)
             yield Row(name, "the scan does not end, or does not begin", wrong=str(error))
 
 

@@ -87,6 +87,8 @@ def read_arrays(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]
 def read_npz(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
     """`read_arrays` of an .npz file, whatever its suffix."""
     try:
+        if not zipfile.is_zipfile(path):
+            raise ValueError("not a zip archive")
         with np.load(path, allow_pickle=False) as archive:
             names = list(archive.files)
             held = [name for name in names if name in wanted]

@@ -231,6 +231,8 @@ def _run(options: argparse.Namespace) -> int:
     if options.point is not None:
         if options.measurement is not None:
             raise ValueError("point: given beside --measurement, expected one of them")
+        if not options.record.is_dir():
+            raise ValueError(f"point: {options.point}, only for a run; {options.record} is no folder")
         from tactile_resonance.scan.recorded import measurement_at
 
         options.measurement = measurement_at(options.record, options.point)

@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
+import scipy.ndimage
+from scipy import special
 
-from tactile_resonance._typing import ComplexArray
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.frf.local_polynomial import kept_plan
 from tactile_resonance.frf.realisations import Agreement, holds_transient
 from tactile_resonance.frf.result import FRF, FrfStatus
@@ -25,6 +27,10 @@ from tactile_resonance.frf.spectra import (
 )
 
 METHODS = ("local polynomial", "average")
+
+FEWEST_AROUND = 21
+"""Lines whose median of the noise one of them is compared with."""
+FALSE_ALARM = 1e-4
 
 WEAK_INPUT_DB = 10.0
 """Input signal-to-noise ratio of a mean spectrum below which Y/U is biased [dB]."""
@@ -131,9 +137,12 @@ def fast_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
         variance = ratio_variance(spectra.spectra, spectra.covariance)
         given = conditional_variance(spectra.covariance)
     status, message = response_status(spectra.spectra, spectra.covariance)
+    frequency_hz, g = spectra.frequency_hz(sample_rate_hz), ratio(spectra.spectra)
+    if status is FrfStatus.OK:
+        status, message = narrow_modes(frequency_hz, g, given, spectra.noise_dof)
     return FRF(
-        frequency_hz=spectra.frequency_hz(sample_rate_hz),
-        g=ratio(spectra.spectra),
+        frequency_hz=frequency_hz,
+        g=g,
         variance_noise=variance,
         noise_dof=spectra.noise_dof,
         actuator_amplitude=np.abs(spectra.spectra[..., 1, :]),
@@ -193,12 +202,15 @@ def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
         given = conditional_variance(noise)
         variance_noise = error_variance(g, noise) / np.mean(power(each[..., 1, :]), axis=-2)
     status, message = _robust_status(each, spectra.covariance, g, g_each)
+    frequency_hz, noise_dof = spectra.frequency_hz(sample_rate_hz), realisations * spectra.noise_dof
+    if status is FrfStatus.OK and given is not None:
+        status, message = narrow_modes(frequency_hz, g, given, noise_dof)
     return FRF(
-        frequency_hz=spectra.frequency_hz(sample_rate_hz),
+        frequency_hz=frequency_hz,
         g=g,
         variance_noise=variance_noise,
         variance_total=variance_total,
-        noise_dof=realisations * spectra.noise_dof,
+        noise_dof=noise_dof,
         total_dof=realisations - 1,
         sensor_variance_given_actuator=given,
         periods=spectra.periods,
@@ -238,6 +250,45 @@ def response_status(
             f"{weak.size} lines: their response is biased",
         )
     return FrfStatus.OK, ""
+
+
+def narrow_modes(
+    frequency_hz: FloatArray, g: ComplexArray, variance: FloatArray | None, dof: int
+) -> tuple[FrfStatus, str]:
+    """SUSPECT where a transient is left of a mode that is narrower than the distance of the lines.
+
+    What the local polynomials leave of the transient of a mode of half width h bins, h < 1, bends the response
+    at its peak by some ``1.6 / h`` times the deviation that it adds to the noise there.
+
+    Parameters
+    ----------
+    frequency_hz : (F,) float
+    g : (..., F) complex
+    variance : (..., F) float or None
+        Of the sensor given the actuator, of so many degrees of freedom; None: nothing can be said.
+    dof : int
+    """
+    if variance is None or frequency_hz.size < FEWEST_AROUND or dof < 2:
+        return FrfStatus.OK, ""
+    beside = (g[..., :-2] + g[..., 2:]) / 2
+    peaks = np.zeros(g.shape, bool)
+    peaks[..., 1:-1] = (np.abs(g[..., 1:-1] - beside) > 0.5 * np.abs(g[..., 1:-1])) & (
+        np.abs(g[..., 1:-1]) > np.minimum(np.abs(g[..., :-2]), np.abs(g[..., 2:]))
+    )
+    around = scipy.ndimage.median_filter(variance, (*[1] * (g.ndim - 1), FEWEST_AROUND), mode="nearest")
+    limit = special.fdtri(2 * dof, 2 * dof * FEWEST_AROUND / 4, 1 - FALSE_ALARM / frequency_hz.size)
+    with np.errstate(invalid="ignore"):
+        found = peaks & (variance > limit * around) & (around > 0)
+    where = np.flatnonzero(found.reshape(-1, frequency_hz.size).any(axis=0))
+    if not where.size:
+        return FrfStatus.OK, ""
+    names = ", ".join(f"{f:g}" for f in frequency_hz[where[:5]])
+    return (
+        FrfStatus.SUSPECT,
+        f"noise of the sensor and response stand out from the lines beside at {names} Hz: a mode "
+        "narrower than the distance of the lines, whose transient the local polynomials do not follow, or "
+        "a tone; the response there may be off by more than its deviations say",
+    )
 
 
 def _robust_status(

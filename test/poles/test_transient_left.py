@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """An FRF in which a transient is left does not give poles of status ok."""
 
+import re
+
 import numpy as np
 import pytest
 
 from tactile_resonance.frf.estimate import frf_of_record
+from tactile_resonance.frf.result import FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import PolesStatus
@@ -86,3 +89,29 @@ def test_several_realisations_from_rest(realisations, periods, half_width_bins):
         if 12 * half_width_bins / periods > 1.5:  # nothing is left after twelve periods
             settled = poles_of(*case, settled=True, realisations=realisations)
             assert settled.status is PolesStatus.OK
+
+
+@pytest.mark.parametrize("realisations", [1, 4])
+@pytest.mark.parametrize("periods", [2, 8])
+@pytest.mark.parametrize("half_width_bins", [0.1, 0.3, 8.0])
+def test_the_frf_of_a_mode_narrower_than_a_bin_is_suspect(periods, realisations, half_width_bins):
+    """From rest its peak is off by some 1.6 deviations over the half width in bins, at any noise."""
+    damping_ratio = half_width_bins * RATE_HZ / SAMPLES / periods / 250
+    for seed in range(3):
+        for settled in (False, True):
+            if settled and half_width_bins < 1:
+                continue  # twelve periods are too few for it
+            case = (periods, damping_ratio, 60)
+            records = [record(seed + 1000 * m, *case, settled=settled) for m in range(realisations)]
+            u, y = (np.stack(channel) for channel in zip(*records, strict=True))
+            frf = frf_of_record(Spectrum.of(u, y), sample_rate_hz=RATE_HZ, harmonics=LINES)
+            s, w0 = 2j * np.pi * frf.frequency_hz, 2 * np.pi * 250
+            truth = 0.1 + 2 * damping_ratio * w0**2 / (s**2 + 2 * damping_ratio * w0 * s + w0**2)
+            worst = np.max(np.abs(frf.g - truth) / np.sqrt(frf.variance_noise))
+            if half_width_bins < 1:
+                assert worst > 4
+                assert frf.status is FrfStatus.SUSPECT
+                assert re.search(r"stand out from the lines beside at .*\b250\b.* Hz", frf.message)
+            else:
+                assert worst < 4.5
+                assert frf.status is FrfStatus.OK
