@@ -14,9 +14,9 @@ import numpy.typing as npt
 from tactile_resonance.fields import band, known, number, require_kind
 from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.distortion import Distortion, estimate_distortion
-from tactile_resonance.frf.estimate import frf_of_record
+from tactile_resonance.frf.estimate import frf_of_record, with_narrow_modes_judged
 from tactile_resonance.frf.excited import find_excited_harmonics
-from tactile_resonance.frf.faults import find_faults
+from tactile_resonance.frf.faults import FaultReport, find_faults
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.frf.spectra import Spectrum
@@ -37,6 +37,8 @@ class Analysis:
     poles : Poles
     distortion : Distortion or None
         Where it was asked for.
+    faults : FaultReport
+        Of the record.
     warnings : tuple of str
         What a reader should know before relying on the figures.
     timing_s : dict
@@ -46,6 +48,7 @@ class Analysis:
     frf: FRF
     poles: Poles
     distortion: Distortion | None
+    faults: FaultReport
     warnings: tuple[str, ...]
     timing_s: dict[str, float]
 
@@ -164,7 +167,7 @@ def analyse(
         )
     if poles.status is PolesStatus.TOO_FEW_LINES:
         raise ValueError(f"band_hz: {poles.message}")
-    frf = faults.marked(frf)
+    frf = with_narrow_modes_judged(faults.marked(frf))
     warnings += [
         f"{name}: {of.message}" for name, of in (("frf", frf), ("poles", poles)) if of.message
     ]
@@ -172,6 +175,7 @@ def analyse(
         frf,
         poles,
         distortion,
+        faults,
         tuple(warnings),
         {
             "excited_lines": found - start,

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_resonance.analysis import analyse
 from tactile_resonance.fields import require_kind, whole
-from tactile_resonance.frf.estimate import frf_of_record
+from tactile_resonance.frf.estimate import frf_of_record, with_narrow_modes_judged
 from tactile_resonance.frf.excited import find_excited_harmonics
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -178,7 +178,10 @@ def estimate_frf(recording: Recording, *, method: str = "local polynomial") -> F
     harmonics = recording.excited_harmonics
     if harmonics is None:
         harmonics = find_excited_harmonics(record)
-    return frf_of_record(record, harmonics, sample_rate_hz=recording.sample_rate_hz, method=method)
+    rate_hz = recording.sample_rate_hz
+    return with_narrow_modes_judged(
+        frf_of_record(record, harmonics, sample_rate_hz=rate_hz, method=method)
+    )
 
 
 def identify_poles(
@@ -233,6 +236,6 @@ def identify_poles(
             raise ValueError(f"band_hz: {poles.message}")
         return poles
     analysis = analyse(data, band_hz=band_hz, structure=structure)
-    frf, poles = analysis.frf, analysis.poles
-    of_record = "" if frf.status is FrfStatus.OK else frf.message
-    return replace(poles, message="; ".join(filter(None, [of_record, poles.message])))
+    of_record = analysis.faults.message if analysis.faults.suspect else ""
+    message = "; ".join(filter(None, [of_record, analysis.poles.message]))
+    return replace(analysis.poles, message=message)

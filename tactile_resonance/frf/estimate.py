@@ -12,7 +12,7 @@ from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.frf.local_polynomial import kept_plan
-from tactile_resonance.frf.realisations import Agreement, holds_transient
+from tactile_resonance.frf.realisations import Agreement, transient_lines
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.spectra import (
     PeriodicSpectra,
@@ -137,12 +137,9 @@ def fast_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
         variance = ratio_variance(spectra.spectra, spectra.covariance)
         given = conditional_variance(spectra.covariance)
     status, message = response_status(spectra.spectra, spectra.covariance)
-    frequency_hz, g = spectra.frequency_hz(sample_rate_hz), ratio(spectra.spectra)
-    if status is FrfStatus.OK:
-        status, message = narrow_modes(frequency_hz, g, given, spectra.noise_dof)
     return FRF(
-        frequency_hz=frequency_hz,
-        g=g,
+        frequency_hz=spectra.frequency_hz(sample_rate_hz),
+        g=ratio(spectra.spectra),
         variance_noise=variance,
         noise_dof=spectra.noise_dof,
         actuator_amplitude=np.abs(spectra.spectra[..., 1, :]),
@@ -201,16 +198,14 @@ def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
         noise = spectra.covariance.mean(axis=-4) / realisations  # (..., 2, 2, F)
         given = conditional_variance(noise)
         variance_noise = error_variance(g, noise) / np.mean(power(each[..., 1, :]), axis=-2)
-    status, message = _robust_status(each, spectra.covariance, g, g_each)
-    frequency_hz, noise_dof = spectra.frequency_hz(sample_rate_hz), realisations * spectra.noise_dof
-    if status is FrfStatus.OK and given is not None:
-        status, message = narrow_modes(frequency_hz, g, given, noise_dof)
+    frequency_hz = spectra.frequency_hz(sample_rate_hz)
+    status, message = _robust_status(each, spectra.covariance, g, g_each, frequency_hz)
     return FRF(
         frequency_hz=frequency_hz,
         g=g,
         variance_noise=variance_noise,
         variance_total=variance_total,
-        noise_dof=noise_dof,
+        noise_dof=realisations * spectra.noise_dof,
         total_dof=realisations - 1,
         sensor_variance_given_actuator=given,
         periods=spectra.periods,
@@ -252,53 +247,53 @@ def response_status(
     return FrfStatus.OK, ""
 
 
-def narrow_modes(
-    frequency_hz: FloatArray, g: ComplexArray, variance: FloatArray | None, dof: int
-) -> tuple[FrfStatus, str]:
-    """SUSPECT where a transient is left of a mode that is narrower than the distance of the lines.
+def with_narrow_modes_judged(frf: FRF) -> FRF:
+    """The FRF; SUSPECT where the transient of a mode narrower than the distance of the lines is left in it.
 
     What the local polynomials leave of the transient of a mode of half width h bins, h < 1, bends the response
     at its peak by some ``1.6 / h`` times the deviation that it adds to the noise there.
 
     Parameters
     ----------
-    frequency_hz : (F,) float
-    g : (..., F) complex
-    variance : (..., F) float or None
-        Of the sensor given the actuator, of so many degrees of freedom; None: nothing can be said.
-    dof : int
+    frf : FRF
+        With (F,) arrays.
     """
-    if variance is None or frequency_hz.size < FEWEST_AROUND or dof < 2:
-        return FrfStatus.OK, ""
-    beside = (g[..., :-2] + g[..., 2:]) / 2
-    peaks = np.zeros(g.shape, bool)
-    peaks[..., 1:-1] = (np.abs(g[..., 1:-1] - beside) > 0.5 * np.abs(g[..., 1:-1])) & (
-        np.abs(g[..., 1:-1]) > np.minimum(np.abs(g[..., :-2]), np.abs(g[..., 2:]))
-    )
-    around = scipy.ndimage.median_filter(variance, (*[1] * (g.ndim - 1), FEWEST_AROUND), mode="nearest")
-    limit = special.fdtri(2 * dof, 2 * dof * FEWEST_AROUND / 4, 1 - FALSE_ALARM / frequency_hz.size)
-    with np.errstate(invalid="ignore"):
-        found = peaks & (variance > limit * around) & (around > 0)
-    where = np.flatnonzero(found.reshape(-1, frequency_hz.size).any(axis=0))
-    if not where.size:
-        return FrfStatus.OK, ""
-    names = ", ".join(f"{f:g}" for f in frequency_hz[where[:5]])
-    return (
-        FrfStatus.SUSPECT,
-        f"noise of the sensor and response stand out from the lines beside at {names} Hz: a mode "
-        "narrower than the distance of the lines, whose transient the local polynomials do not follow, or "
-        "a tone; the response there may be off by more than its deviations say",
+    g, variance, lines = frf.g, frf.sensor_variance_given_actuator, frf.frequency_hz.size
+    if variance is None or lines < FEWEST_AROUND or frf.noise_dof < 2:
+        return frf
+    size, beside = np.abs(g), (g[:-2] + g[2:]) / 2
+    peaks = np.zeros(lines, bool)
+    peaks[1:-1] = np.abs(g[1:-1] - beside) > size[1:-1] / 2
+    peaks[1:-1] &= size[1:-1] > np.minimum(size[:-2], size[2:])
+    around = scipy.ndimage.median_filter(variance, FEWEST_AROUND, mode="nearest")
+    dof = 2 * frf.noise_dof
+    limit = special.fdtri(dof, dof * FEWEST_AROUND / 4, 1 - FALSE_ALARM / lines)
+    found = peaks & (variance > limit * around) & (around > 0)
+    if not found.any():
+        return frf
+    names = ", ".join(f"{f:g}" for f in frf.frequency_hz[found][:5])
+    return frf.suspected(
+        f"noise of the sensor and response stand out from the lines beside at {names} Hz: a mode narrower "
+        "than the distance of the lines, whose transient the local polynomials do not follow, or a tone; "
+        "the response there may be off by more than its deviations say"
     )
 
 
 def _robust_status(
-    each: ComplexArray, covariance: ComplexArray | None, g: ComplexArray, g_each: ComplexArray
+    each: ComplexArray,
+    covariance: ComplexArray | None,
+    g: ComplexArray,
+    g_each: ComplexArray,
+    frequency_hz: FloatArray,
 ) -> tuple[FrfStatus, str]:
-    if covariance is None and holds_transient(each, g):
+    where = transient_lines(each, g) if covariance is None else None
+    if where is not None:
+        ends_hz = frequency_hz[where][[0, -1]]
         return (
             FrfStatus.MODEL_ERROR,
-            "a transient: what the realisations differ by is alike on neighbouring lines, which noise "
-            "and distortion are not; record two periods or more of each, or wait before the record",
+            f"a transient at {ends_hz[0]:g} to {ends_hz[1]:g} Hz: what the realisations differ by is alike "
+            "on neighbouring lines, which noise and distortion are not; record two periods or more of "
+            "each, or wait before the record",
         )
     remarks = [text for text in Agreement.of(g_each.reshape(-1, *g_each.shape[-2:])).remarks() if text]
     if remarks:

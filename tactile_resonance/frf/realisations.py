@@ -141,8 +141,8 @@ def _gain(gain: complex) -> str:
     return f"{abs(gain):.3g} times the gain" + (f" and {turned} degrees from the phase" if turned else "")
 
 
-def holds_transient(each: ComplexArray, g: ComplexArray) -> bool:
-    """Whether neighbouring lines of ``Y_m - G U_m`` are more alike than chance makes them.
+def transient_lines(each: ComplexArray, g: ComplexArray) -> slice | None:
+    """Lines on which neighbours of ``Y_m - G U_m`` are more alike than chance makes them; None: nowhere.
 
     Noise and stochastic distortion are independent from line to line, the spectrum of a transient is
     smooth. Over M realisations the real part of the correlation of neighbours has mean 0 and variance
@@ -161,11 +161,12 @@ def holds_transient(each: ComplexArray, g: ComplexArray) -> bool:
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = np.nan_to_num(product / (size[..., 1:] * size[..., :-1]))
     count, degrees = correlation.shape[-1], 2 * (error.shape[-2] - 1)
-    scores, tests = [], 0
-    for window in sorted({min(window, count) for window in (*WINDOWS, count) if count}):
-        sums = np.cumsum(np.insert(correlation, 0, 0.0, axis=-1), axis=-1)
-        sums = sums[..., window:] - sums[..., :-window]
-        scores.append(np.max(sums) * np.sqrt(degrees / window))
-        tests += sums.size
-    return bool(scores) and max(scores) > -special.ndtri(FALSE_ALARM / tests)
-
+    sums = np.cumsum(np.insert(correlation, 0, 0.0, axis=-1), axis=-1)  # (..., F)
+    found, tests = [], 0
+    for window in {min(window, count) for window in (*WINDOWS, count) if count}:
+        of_window = (sums[..., window:] - sums[..., :-window]).reshape(-1, count - window + 1)
+        score, start = of_window.max(), int(of_window.max(axis=0).argmax())
+        found.append((score * np.sqrt(degrees / window), slice(start, start + window + 1)))
+        tests += of_window.size
+    score, where = max(found, key=lambda of: of[0], default=(0.0, slice(0)))
+    return where if score > -special.ndtri(FALSE_ALARM / max(tests, 1)) else None

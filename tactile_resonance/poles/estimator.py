@@ -84,8 +84,7 @@ def poles_of_frf(
             poles = poles.noting(f"from the FRF: {reason}")
         return poles
     poles = identify_poles_from_bins(frf.bins, band_hz, structure)
-    said = poles.status is PolesStatus.MODEL_ERROR and frf.status is FrfStatus.MODEL_ERROR
-    if frf.status is not FrfStatus.OK and not said:
+    if frf.status not in (FrfStatus.OK, FrfStatus.MODEL_ERROR):  # its realisations are judged here, too
         poles = poles.noting(frf.message)
     return second_attempt(poles, frf, band_hz, structure)
 

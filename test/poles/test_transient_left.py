@@ -9,9 +9,11 @@ import pytest
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.result import FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.front import estimate_frf
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
+from tactile_resonance.recording.recording import make_recording
 
 RATE_HZ, SAMPLES, LINES = 5000.0, 2000, np.arange(4, 401)
 
@@ -104,7 +106,8 @@ def test_the_frf_of_a_mode_narrower_than_a_bin_is_suspect(periods, realisations,
             case = (periods, damping_ratio, 60)
             records = [record(seed + 1000 * m, *case, settled=settled) for m in range(realisations)]
             u, y = (np.stack(channel) for channel in zip(*records, strict=True))
-            frf = frf_of_record(Spectrum.of(u, y), sample_rate_hz=RATE_HZ, harmonics=LINES)
+            recording = make_recording(u, y, sample_rate_hz=RATE_HZ, excited_harmonics=LINES)
+            frf = estimate_frf(recording)
             s, w0 = 2j * np.pi * frf.frequency_hz, 2 * np.pi * 250
             truth = 0.1 + 2 * damping_ratio * w0**2 / (s**2 + 2 * damping_ratio * w0 * s + w0**2)
             worst = np.max(np.abs(frf.g - truth) / np.sqrt(frf.variance_noise))
