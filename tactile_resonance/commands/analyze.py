@@ -334,8 +334,8 @@ def as_text(analysis: Analysis) -> str:
     for k, pole in enumerate(poles.poles_rad_s):
         f0_std, damping_std = np.sqrt(np.diag(poles.best_covariance[k]))
         lines.append(
-            f"mode: f0 {poles.f0_hz[k]:.4f} +- {f0_std:.2g} Hz, damping ratio "
-            f"{poles.damping_ratio[k]:.6f} +- {damping_std:.2g}, poles at "
+            f"mode: f0 {poles.f0_hz[k]:.4f} +- {_std(f0_std)} Hz, damping ratio "
+            f"{poles.damping_ratio[k]:.6f} +- {_std(damping_std)}, poles at "
             f"{pole.real:.3f} + {pole.imag:.3f}j rad/s and its conjugate"
         )
     if analysis.distortion is not None:
@@ -343,6 +343,10 @@ def as_text(analysis: Analysis) -> str:
     lines.append(f"status: {poles.status.value}")
     lines += [f"note: {warning}" for warning in analysis.warnings]
     return "\n".join(lines)
+
+
+def _std(value: float) -> str:
+    return f"{value:.2g}" if np.isfinite(value) else "unknown"
 
 
 def _check_outputs(options: argparse.Namespace) -> None:

@@ -113,9 +113,9 @@ class Agreement:
         for m in records if records.size > 2 else ():
             rest = records[records != m]
             if not pairs[np.ix_(rest, rest)].any():
-                return f"realisation {m + 1} responds with {_gain(self.gain[k, m, rest].mean())} of the others"
+                return _difference(m, self.gain[k, m, rest].mean(), "the others")
         m, n = np.argwhere(pairs)[0]
-        return f"realisation {n + 1} responds with {_gain(self.gain[k, n, m])} of realisation {m + 1}"
+        return _difference(n, self.gain[k, n, m], f"realisation {m + 1}")
 
 
 def _apart(
@@ -136,9 +136,12 @@ def _apart(
     return lacks & ~others.any(axis=-1) & (alike[rows, place] > ALIKE)[:, None]
 
 
-def _gain(gain: complex) -> str:
-    turned = round(np.degrees(np.angle(gain)))
-    return f"{abs(gain):.3g} times the gain" + (f" and {turned} degrees from the phase" if turned else "")
+def _difference(m: int, gain: complex, others: str) -> str:
+    turned = abs(np.degrees(np.angle(gain)))
+    return (
+        f"realisation {m + 1} is not of the same system as {others}: {abs(gain):.2f} times the gain, phase off "
+        f"by {turned:.0f} degrees"
+    )
 
 
 def transient_lines(each: ComplexArray, g: ComplexArray) -> slice | None:
