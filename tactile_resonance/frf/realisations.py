@@ -113,8 +113,8 @@ class Agreement:
         for m in records if records.size > 2 else ():
             rest = records[records != m]
             if not pairs[np.ix_(rest, rest)].any():
-                return _difference(m, self.gain[k, m, rest].mean(), "the others")
-        m, n = np.argwhere(pairs)[0]
+                return _difference(int(m), self.gain[k, m, rest].mean(), "the others")
+        m, n = np.argwhere(pairs)[0].tolist()
         return _difference(n, self.gain[k, n, m], f"realisation {m + 1}")
 
 
