@@ -77,23 +77,6 @@ class BenchEffects:
 DEFAULT_EFFECTS = BenchEffects()
 
 
-@dataclass(frozen=True, eq=False)
-class SignalParts:
-    """What a block is made of, (samples,) arrays in volts.
-
-    ``actuator = actuator_v + actuator_noise_v`` and
-    ``sensor = linear_v + distortion_v + disturbance_v + noise_v``, then quantised. `disturbance_v`
-    is hum, offset and drift.
-    """
-
-    actuator_v: FloatArray
-    actuator_noise_v: FloatArray
-    linear_v: FloatArray
-    distortion_v: FloatArray
-    disturbance_v: FloatArray
-    noise_v: FloatArray
-
-
 def convert(volts: FloatArray, scale_v: float, bits: int) -> Channel:
     """Quantise volts to signed counts, clipped to the range of the converter.
 
@@ -142,11 +125,6 @@ class BenchRun:
 
     The state of the sensor carries over from block to block and from excitation to excitation.
     Playing the same excitation again continues its periods; another one starts a new realisation.
-
-    Attributes
-    ----------
-    parts : SignalParts or None
-        What the newest block is made of, where the run keeps it.
     """
 
     def __init__(
@@ -155,7 +133,6 @@ class BenchRun:
         coupled: CoupledBimorph | Callable[[float], CoupledBimorph],
         seed: int = 0,
         effects: BenchEffects = DEFAULT_EFFECTS,
-        keep_parts: bool = False,
     ) -> None:
         good = isinstance(seed, (int, np.integer)) and seed >= 0
         require(good, "seed", seed, "an integer, 0 or above")
@@ -164,14 +141,11 @@ class BenchRun:
         self.seed = seed
         self.effects = effects
         self._acquisition = sensor.acquisition
-        self._keep_parts = keep_parts
-        self.parts: SignalParts | None = None
         skew, negligible_v = effects.channel_skew_s, self.negligible_v
         direct = PoleResidueModel(np.zeros(0, complex), np.zeros(0, complex), 1.0)
         self._drive = ResponseStream(direct, delay_s=max(0.0, -skew))
         late_s, modal = max(0.0, skew), self.coupled.modal
         self._sensor: ResponseStream | NonlinearStream | VaryingStream
-        self._linear: ResponseStream | None = None  # beside a nonlinear one, where asked for
         if self._coupled_at is not None:
             off = not effects.nonlinearity
             require(off, "nonlinearity", True, "off while the contact changes")
@@ -180,8 +154,6 @@ class BenchRun:
             )
         elif effects.nonlinearity:
             self._sensor = NonlinearStream(modal, sensor.nonlinear, delay_s=late_s)
-            if keep_parts:
-                self._linear = ResponseStream(modal, delay_s=late_s)
         else:
             self._sensor = ResponseStream(modal, delay_s=late_s, negligible_v=negligible_v)
         self._lines: Lines | None = None
@@ -231,10 +203,7 @@ class BenchRun:
             self._realisation += 1
             self._index = 0
         index, start_s = self._index, self._samples / lines.sample_rate_hz
-        kept: list[FloatArray] = []
-        made = [self._make_period(self._lines, kept) for _ in range(periods)]
-        if self._keep_parts:
-            self.parts = SignalParts(*np.concatenate(kept, axis=1))
+        made = [self._make_period(self._lines) for _ in range(periods)]
         drive, sensed = (np.concatenate(channel) for channel in zip(*made, strict=True))
         return Record(
             actuator=self._channel(drive, self._acquisition.actuator_scale_v),
@@ -252,22 +221,16 @@ class BenchRun:
         for _ in range(periods):
             yield self.block(lines)
 
-    def _make_period(
-        self, lines: Lines, kept: list[FloatArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Drive and sensor voltage over one period; where parts are kept, theirs (6, samples) too."""
+    def _make_period(self, lines: Lines) -> tuple[FloatArray, FloatArray]:
+        """Drive and sensor voltage over one period."""
         samples = lines.samples_per_period
         drive, clean = self._drive.play(lines), self._sensor.play(lines)
-        linear = clean if self._linear is None else self._linear.play(lines)
         drive_noise = self._noise(_ACTUATOR, self.effects.actuator_noise_v, samples)
         sensor_rms = self._acquisition.noise_rms_v(lines.sample_rate_hz)
         noise = self._noise(_SENSOR, sensor_rms if self.effects.noise else 0.0, samples)
         disturbance = self._disturbance(lines.sample_rate_hz, samples)
         self._index += 1
         self._samples += samples
-        if self._keep_parts:
-            parts = (drive, drive_noise, linear, clean - linear, disturbance, noise)
-            kept.append(np.stack([np.zeros(samples) if part is None else part for part in parts]))
         return _sum(drive, drive_noise), _sum(clean, disturbance, noise)
 
     def _channel(self, volts: FloatArray, scale_v: float) -> Channel:
@@ -343,7 +306,6 @@ class SimulatedBench:
         hold_time_s: float = 1.0,
         seed: int = 0,
         effects: BenchEffects = DEFAULT_EFFECTS,
-        keep_parts: bool = False,
     ) -> BenchRun:
         """Return a run of the sensor at rest.
 
@@ -359,11 +321,9 @@ class SimulatedBench:
             Of everything random. The same seed gives the same samples however they are divided
             into blocks.
         effects : BenchEffects
-        keep_parts : bool
-            Keep clean signal, distortion, disturbance and noise of the newest block apart, in `BenchRun.parts`.
         """
         coupled = self.coupled(tissue, force_n=force_n, hold_time_s=hold_time_s)
-        return BenchRun(self.sensor, coupled, seed, effects, keep_parts)
+        return BenchRun(self.sensor, coupled, seed, effects)
 
     def start_varying(
         self,
