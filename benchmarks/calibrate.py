@@ -133,7 +133,7 @@ def _contradicted(case: tuple[int, str, float]) -> tuple[float, bool]:
     if "coupling" in what:
         chi = beam.coupling * np.where(np.arange(beam.coupling.size) == 1, 1.02, 1)
         coupled = replace(coupled, beam=replace(beam, coupling=chi))
-    run = BenchRun(at.bench.sensor, coupled, 7000 + of, BenchEffects(), False)
+    run = BenchRun(at.bench.sensor, coupled, 7000 + of, BenchEffects())
     signal = excitation(duration_s)
     found = at.estimator(contact_record([run.block(signal)], signal), 0.01, 1e-4)
     return duration_s, found.status is ContactStatus.CONTRADICTED

@@ -120,13 +120,16 @@ class _Round:
         return self.plan.problem.response(self.solution.theta[:, 0])
 
     @property
-    def responses(self) -> ComplexArray:
-        """(batch, M, K_e) of each realisation on excited lines, without its transient; NaN without input."""
-        problem, driven = self.plan.problem, slice(self.data.undriven, None)
+    def responses(self) -> tuple[ComplexArray, ComplexArray]:
+        """(batch, M, K_e) of each realisation on excited lines, with and without its transient; NaN: no input.
+
+        Of a wrong fit the transients hold part of what realisations differ by; those of a right one hide some.
+        """
+        problem, driven, data = self.plan.problem, slice(self.data.undriven, None), self.data
         alpha, _, gamma = problem.split(self.solution.theta)
         transient = (gamma @ problem.transient[driven].T) / (alpha @ problem.denominator[driven].T)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray((self.data.y_driven - transient) / self.data.u_driven)
+            return data.y_driven / data.u_driven, (data.y_driven - transient) / data.u_driven
 
     @cached_property
     def variance(self) -> FloatArray:
@@ -414,10 +417,13 @@ def _each_by_itself(fit: Judged, total: FloatArray, first: _Round) -> Judged:
     for k in (0, 1):
         systematic[..., k, k] += weight[:, None] * np.maximum(np.nan_to_num(more[..., k]), 0.0)
     odd, remark = spread.remarks()
-    agreement = Agreement.of(first.responses)
-    wrong, unknown = agreement.contradiction, agreement.opposed.any(axis=(1, 2), keepdims=True)
-    if np.any(unknown):  # what is left of their mean is of no system
-        covariance, total = (np.where(unknown, np.nan, one) for one in (covariance, total))
+    wrong = np.zeros(odd.size, bool)
+    for agreement in map(Agreement.of, first.responses):
+        remark = np.where(agreement.contradiction, agreement.remarks(), remark)
+        wrong |= agreement.contradiction
+        unknown = agreement.opposed.any(axis=(1, 2), keepdims=True)
+        if np.any(unknown):  # what is left of their mean is of no system
+            covariance, total = (np.where(unknown, np.nan, one) for one in (covariance, total))
     return replace(
         fit,
         theta=changed,
@@ -425,5 +431,5 @@ def _each_by_itself(fit: Judged, total: FloatArray, first: _Round) -> Judged:
         total=total,
         suspect=fit.suspect | odd | wrong,
         systematic=systematic,
-        remark=np.where(wrong, agreement.remarks(), remark),
+        remark=remark,
     )

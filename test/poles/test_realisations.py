@@ -126,6 +126,16 @@ def test_records_of_different_systems_are_no_certain_result(realisations, period
         assert judge(errors, total, np.eye(2))[1] > 0.9
 
 
+def test_transients_do_not_hide_that_records_are_of_different_systems():
+    """Of a narrow mode and one period they take up what differs: off by up to eleven deviations."""
+    all_plants = plants(0.005, 40.0, 1, 7)
+    u, y = spectra(all_plants, np.random.default_rng(5), 50)
+    y[:, 1] *= -1
+    result = plan_of(1).from_bins(u, y)
+    assert not result.has_status(PolesStatus.OK).any()
+    assert all("realisation 2" in remark for remark in result.remark)
+
+
 NOT_LINEAR = (RATE_HZ, SAMPLES, 2, LINES, (200.0, 300.0), BARE)
 
 

@@ -34,7 +34,7 @@ def bench():
 def measured(bench, coupled, design, blocks, seed):
     """Poles of some blocks from rest, as frf_node and poles_node make them."""
     excitation, frf = excitation_of(design, seed), MeasurementFrf(0)
-    run = BenchRun(bench.sensor, coupled, seed, BenchEffects(), False)
+    run = BenchRun(bench.sensor, coupled, seed, BenchEffects())
     for _ in range(blocks):
         found = frf.add(run.block(excitation), excitation)
     return poles_of_bands(found, design.bands)
