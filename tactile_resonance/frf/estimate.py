@@ -295,7 +295,8 @@ def _robust_status(
             "on neighbouring lines, which noise and distortion are not; record two periods or more of "
             "each, or wait before the record",
         )
-    remarks = [text for text in Agreement.of(g_each.reshape(-1, *g_each.shape[-2:])).remarks() if text]
+    g_each, u = (x.reshape(-1, *g_each.shape[-2:]) for x in (g_each, each[..., 1, :]))
+    remarks = list(filter(None, Agreement.of(g_each, u).remarks()))
     if remarks:
         return FrfStatus.MODEL_ERROR, remarks[0]
     if covariance is not None:

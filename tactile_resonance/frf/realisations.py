@@ -52,20 +52,23 @@ class Agreement:
     apart: BoolArray
 
     @classmethod
-    def of(cls, response: ComplexArray) -> Agreement:
+    def of(cls, response: ComplexArray, u: ComplexArray) -> Agreement:
         """Of responses.
 
         Parameters
         ----------
         response : (batch, M, F) complex
             Of each realisation; lines without input, NaN, count as none.
+        u : (batch or 1, M, F) complex
+            Inputs: a line that is hardly driven shows noise.
 
         Notes
         -----
         Noise and stochastic distortion of two realisations are independent, so that they lower the
         coherence ``|H_mn|^2 / (H_mm H_nn)``, ``H_mn = sum G_m conj G_n``, but turn no phase.
         """
-        response = np.where(np.isfinite(response), response, 0)
+        drive = np.sqrt(power(u).mean(axis=1, keepdims=True))
+        response = np.where(np.isfinite(response), response * drive, 0)
         size = power(response).sum(axis=1)  # (batch, F)
         few = min(LINES_ALIKE, size.shape[-1])
         weight = 1 / np.maximum(size + np.partition(size, -few, axis=-1)[:, [-few]], np.finfo(float).tiny)

@@ -418,7 +418,8 @@ def _each_by_itself(fit: Judged, total: FloatArray, first: _Round) -> Judged:
         systematic[..., k, k] += weight[:, None] * np.maximum(np.nan_to_num(more[..., k]), 0.0)
     odd, remark = spread.remarks()
     wrong = np.zeros(odd.size, bool)
-    for agreement in map(Agreement.of, first.responses):
+    for response in first.responses:
+        agreement = Agreement.of(response, first.data.u_driven)
         remark = np.where(agreement.contradiction, agreement.remarks(), remark)
         wrong |= agreement.contradiction
         unknown = agreement.opposed.any(axis=(1, 2), keepdims=True)
