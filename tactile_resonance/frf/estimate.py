@@ -275,7 +275,7 @@ def with_narrow_modes_judged(frf: FRF) -> FRF:
     return frf.suspected(
         f"noise of the sensor and response stand out from the lines beside at {names} Hz: a mode narrower "
         "than the distance of the lines, whose transient the local polynomials do not follow, or a tone; "
-        "the response there may be off by more than its deviations say"
+        "of a mode narrower than a bin the response there is off by more than its deviations"
     )
 
 
@@ -291,9 +291,9 @@ def _robust_status(
         ends_hz = frequency_hz[where][[0, -1]]
         return (
             FrfStatus.MODEL_ERROR,
-            f"a transient at {ends_hz[0]:g} to {ends_hz[1]:g} Hz: what the realisations differ by is alike "
-            "on neighbouring lines, which noise and distortion are not; record two periods or more of "
-            "each, or wait before the record",
+            f"a transient at {ends_hz[0]:g} to {ends_hz[1]:g} Hz, or a drift, or a tone between lines: what "
+            "the realisations differ by is alike on neighbouring lines, which noise and distortion are not; "
+            "record two periods or more of each, or wait before the record",
         )
     g_each, u = (x.reshape(-1, *g_each.shape[-2:]) for x in (g_each, each[..., 1, :]))
     remarks = list(filter(None, Agreement.of(g_each, u).remarks()))

@@ -218,11 +218,14 @@ class MeasurementFrf:
         self._periods[realisation] = periods
         if periods < max(self._periods.values()):
             return  # it counts once it is as long as the others
-        each = [of for of, _ in self._spectra.values()]
+        # one of which blocks were lost has less of everything: with it the others would count as as short
+        short = [number for number in self._spectra if self._periods[number] < periods]
+        for number in short:
+            self._note(f"realisation {number}: left out, shorter than the others")
+        whole = [of for number, of in self._spectra.items() if number not in short]
+        each = [of for of, _ in whole]
         frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
-        stacked = [
-            stacked_bins(of) for of in zip(*(of for _, of in self._spectra.values()), strict=True)
-        ]
+        stacked = [stacked_bins(of) for of in zip(*(of for _, of in whole), strict=True)]
         known = [of for of in stacked if of is not None and of.u.size <= MOST_BINS]
         if not known or len(known) < len(stacked):
             known = []
@@ -234,8 +237,9 @@ class MeasurementFrf:
         )
 
     def _distortion(self, excitation: Excitation) -> tuple[BandDistortion, ...]:
-        """In each band, from all realisations so far."""
-        realisations = list(self._detection.values())
+        """In each band, from the realisations that count so far."""
+        longest = max(self._periods.values())
+        realisations = [of for k, of in self._detection.items() if self._periods[k] == longest]
         return tuple(
             distortion_in_band(
                 stacked_spectra([of[k] for of in realisations]),

@@ -151,8 +151,8 @@ def transient_lines(each: ComplexArray, g: ComplexArray) -> slice | None:
     """Lines on which neighbours of ``Y_m - G U_m`` are more alike than chance makes them; None: nowhere.
 
     Noise and stochastic distortion are independent from line to line, the spectrum of a transient is
-    smooth. Over M realisations the real part of the correlation of neighbours has mean 0 and variance
-    ``1 / (2 (M - 1))`` then, whatever the noise of each line.
+    smooth. Products of neighbours have mean 0 and bring their own variance then, so that lines and
+    realisations may differ in noise.
 
     Parameters
     ----------
@@ -162,17 +162,19 @@ def transient_lines(each: ComplexArray, g: ComplexArray) -> slice | None:
         Mean response.
     """
     error = each[..., 0, :] - g[..., None, :] * each[..., 1, :]  # (..., M, F)
-    size = np.sqrt(power(error).sum(axis=-2))
+    records, size = error.shape[-2], power(error)
     product = np.real(error[..., 1:] * error[..., :-1].conj()).sum(axis=-2)  # (..., F - 1)
+    # of M errors that add up to zero M - 1 are free
+    variance = (size[..., 1:] * size[..., :-1]).sum(axis=-2) * records / (2 * (records - 1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        correlation = np.nan_to_num(product / (size[..., 1:] * size[..., :-1]))
-    count, degrees = correlation.shape[-1], 2 * (error.shape[-2] - 1)
-    sums = np.cumsum(np.insert(correlation, 0, 0.0, axis=-1), axis=-1)  # (..., F)
+        alike = np.nan_to_num(product / np.sqrt(variance))
+    count = alike.shape[-1]
+    sums = np.cumsum(np.insert(alike, 0, 0.0, axis=-1), axis=-1)  # (..., F)
     found, tests = [], 0
     for window in {min(window, count) for window in (*WINDOWS, count) if count}:
         of_window = (sums[..., window:] - sums[..., :-window]).reshape(-1, count - window + 1)
         score, start = of_window.max(), int(of_window.max(axis=0).argmax())
-        found.append((score * np.sqrt(degrees / window), slice(start, start + window + 1)))
+        found.append((score / np.sqrt(window), slice(start, start + window + 1)))
         tests += of_window.size
     score, where = max(found, key=lambda of: of[0], default=(0.0, slice(0)))
     return where if score > -special.ndtri(FALSE_ALARM / max(tests, 1)) else None

@@ -92,6 +92,25 @@ def test_the_first_period_has_no_covariance(channels):
     assert frf.variance_total is not None
 
 
+def test_a_realisation_that_lost_blocks_does_not_shorten_the_others():
+    """One of its four periods is left: with it all counted as records of one period, without covariance."""
+    rng = np.random.default_rng(3)
+    u = np.stack([np.tile(excitation(m).period(), (4, 1)) for m in range(3)])
+    y = 0.5 * np.roll(u, 2, axis=-1) + 1e-3 * rng.standard_normal(u.shape)
+    measurement = MeasurementFrf(1, bins_band_hz=(80.0, 120.0))
+    for m in range(3):
+        for p in range(4):
+            if (m, p) != (0, 1):
+                frf = measurement.add(record(u[m, p], y[m, p], m, p), excitation(m))
+    options = {"sample_rate_hz": RATE_HZ, "harmonics": excitation().harmonics}
+    expected = frf_of_record(Spectrum.of(u[1:], y[1:]), **options)
+    assert_equal(replace(frf, status=FrfStatus.OK), expected)
+    assert (frf.realisations, frf.periods, frf.status) == (2, 4, FrfStatus.SUSPECT)
+    assert frf.bins.u.shape[0] == 2
+    assert "realisation 0: blocks lost" in frf.message
+    assert "realisation 0: left out, shorter than the others" in frf.message
+
+
 def test_a_realisation_that_was_lost_is_no_failure(channels):
     u, y = channels
     measurement = MeasurementFrf(1)
