@@ -57,8 +57,8 @@ def run(options: argparse.Namespace) -> int:
     if structure is not None and terms is not None:
         structure = replace(structure, numerator_order=terms)
     band_hz = None if options.band is None else band(options.band, "--band")
-    twice = [run for run in options.runs if options.runs.count(run) > 1]
-    require(not twice, "RUN", str(twice[0]) if twice else None, "each run once")
+    different = len({run.resolve() for run in options.runs})
+    require(different == len(options.runs), "RUN", [str(run) for run in options.runs], "each run once")
     output = options.output
     if output is None:
         several = len(options.runs) > 1

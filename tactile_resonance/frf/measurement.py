@@ -43,8 +43,8 @@ class MeasurementFrf:
     order, dof : int
         Of the local polynomial method.
     bins_band_hz : (low, high), optional
-        All bins of this band go with the FRF, as long as all realisations have as many periods and
-        the bins of all are no more than `MOST_BINS`; where an excitation names bands, theirs instead.
+        All bins of this band go with the FRF, as long as those of all realisations are no more than
+        `MOST_BINS`; where an excitation names bands, theirs instead.
     """
 
     def __init__(
@@ -80,7 +80,8 @@ class MeasurementFrf:
 
         A gap in the block indices is noted; what follows it in that realisation is not used, because
         the periods would no longer be consecutive. A block that comes twice is used once. A realisation
-        under way counts once it has as many periods as the ones before.
+        under way counts once it has as many periods as the ones before; one that ends with fewer is left
+        out, which is noted.
 
         Raises
         ------
@@ -218,14 +219,11 @@ class MeasurementFrf:
         self._periods[realisation] = periods
         if periods < max(self._periods.values()):
             return  # it counts once it is as long as the others
-        # one of which blocks were lost has less of everything: with it the others would count as as short
-        short = [number for number in self._spectra if self._periods[number] < periods]
-        for number in short:
+        for number in self._spectra.keys() - self._whole:
             self._note(f"realisation {number}: left out, shorter than the others")
-        whole = [of for number, of in self._spectra.items() if number not in short]
-        each = [of for of, _ in whole]
+        each, bins_of_each = zip(*(self._spectra[number] for number in self._whole), strict=True)
         frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
-        stacked = [stacked_bins(of) for of in zip(*(of for _, of in whole), strict=True)]
+        stacked = [stacked_bins(of) for of in zip(*bins_of_each, strict=True)]
         known = [of for of in stacked if of is not None and of.u.size <= MOST_BINS]
         if not known or len(known) < len(stacked):
             known = []
@@ -236,10 +234,15 @@ class MeasurementFrf:
             distortion=self._distortion(excitation),
         )
 
-    def _distortion(self, excitation: Excitation) -> tuple[BandDistortion, ...]:
-        """In each band, from the realisations that count so far."""
+    @property
+    def _whole(self) -> list[int]:
+        """Realisations that count: with one that lost blocks all others would count as equally short."""
         longest = max(self._periods.values())
-        realisations = [of for k, of in self._detection.items() if self._periods[k] == longest]
+        return [number for number in self._spectra if self._periods[number] == longest]
+
+    def _distortion(self, excitation: Excitation) -> tuple[BandDistortion, ...]:
+        """In each band, from all realisations that count."""
+        realisations = [self._detection[number] for number in self._whole if number in self._detection]
         return tuple(
             distortion_in_band(
                 stacked_spectra([of[k] for of in realisations]),

@@ -84,7 +84,8 @@ def poles_of_frf(
             poles = poles.noting(f"from the FRF: {reason}")
         return poles
     poles = identify_poles_from_bins(frf.bins, band_hz, structure)
-    if frf.status not in (FrfStatus.OK, FrfStatus.MODEL_ERROR):  # its realisations are judged here, too
+    told = poles.status is PolesStatus.MODEL_ERROR or frf.periods == 1  # a transient is estimated here
+    if frf.status is not FrfStatus.OK and not (frf.status is FrfStatus.MODEL_ERROR and told):
         poles = poles.noting(frf.message)
     return second_attempt(poles, frf, band_hz, structure)
 
@@ -144,7 +145,7 @@ def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelSt
     bins = frf.bins
     if bins is None:
         return (
-            "the FRF brings no bins: they were not asked for, or its realisations differ in periods"
+            "the FRF brings no bins: they were not asked for, or too many"
         )
     low_hz, high_hz = bins.band_hz
     margin = bins.resolution_hz * (1 + 1e-9)  # the band's ends need not lie on bins
