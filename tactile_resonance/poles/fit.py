@@ -88,6 +88,21 @@ class Solution:
             if f.name not in ("noise", "plain") and getattr(self, f.name).size:
                 getattr(self, f.name)[which] = getattr(others, f.name)
 
+    def inverse(self, shared: int) -> FloatArray:
+        """(points, s + M c, s + M c) of the normal matrix of all coefficients; NaN where `marginal` is."""
+        points, records, n = self.theta.shape
+        if records == 1:
+            return self.marginal[:, 0]
+        normal, own = self.normal.sum(axis=2), n - shared
+        whole = np.zeros((points, *2 * [shared + records * own]))
+        whole[:, :shared, :shared] = normal[:, :, :shared, :shared].sum(axis=1)
+        for m in range(records):
+            here = slice(shared + m * own, shared + (m + 1) * own)
+            whole[:, here, :shared] = normal[:, m, shared:, :shared]
+            whole[:, :shared, here] = normal[:, m, :shared, shared:]
+            whole[:, here, here] = normal[:, m, shared:, shared:]
+        return likelihood.invert(whole)[0]
+
     def sandwich(self, normal: FloatArray, shared: int) -> FloatArray:
         """(points, s, s) of the shared coefficients, of gradients with covariances (points, M, n, n)."""
         rows = self.marginal[:, :, :shared]

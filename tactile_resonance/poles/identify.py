@@ -11,6 +11,7 @@ from scipy import special
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.poles.judgement import Judged, assemble, single
+from tactile_resonance.poles.lacking import Lack
 from tactile_resonance.poles.lines import (
     WeightedLines,
     checked_band,
@@ -250,6 +251,9 @@ def _judged(
     cost, expected = fit.cost, known.expected_cost(parameters)
     suspect = level_known & known.contradicts(cost, parameters, MODEL_ERROR_PROBABILITY)
     suspect |= are_smooth(residual, parameters)
+    asked = fit.converged & (suspect | (used.size == 1)) & (not plan.structure.delay)
+    lack = Lack.of(of_fit, lines.data, fit, asked, np.where(level_known, 1.0, 0.0))
+    suspect |= np.isfinite(lack.found[:, 0])
     kind = known.kind
     if not level_known.all():
         # the residuals are all there is: they hold noise, distortion and model error together
@@ -260,9 +264,11 @@ def _judged(
         from_residuals = plain * (level * student_variance(dof))[:, None, None]
         total = np.where(known_here, unknown if total is None else total, from_residuals)
         # what rounding leaves of exact data says nothing
-        suspect &= level_known | (level > ROUNDED)
+        noisy = level_known | (level > ROUNDED)
+        suspect, lack = suspect & noisy, lack.only_where(noisy)
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
         kind = np.where(level_known, kind, len(KINDS))
+    lack = lack.only_where(~suspect)
     judged = Judged.of(
         plan,
         used,
@@ -277,7 +283,9 @@ def _judged(
         total=total,
         kind=kind,
         level_known=level_known,
-        systematic=systematic_of(plan, lines.data, fit.theta, suspect, of_fit),
+        systematic=systematic_of(plan, lines.data, fit.theta, suspect, of_fit) + lack.doubt,
+        lacking=np.where(suspect[:, None], lack.found, np.nan),
+        remark=lack.remarks,
         dispensable=of_fit.dispensable(lines.data, fit),
     )
     return of_fit, judged

@@ -292,7 +292,7 @@ class JointPlan(FitPlan):
 
     @cached_property
     def directions(self) -> Directions:
-        """What a richer model has in addition, on the excited bins."""
+        """What a richer model has in addition, on the driven bins."""
         x = self._x[self.excited_at]
         return Directions.on_lines(
             self.frequency_hz(self.excited_bins), x, self.structure.numerator_order
@@ -300,7 +300,7 @@ class JointPlan(FitPlan):
 
     @cached_property
     def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Bases of A, B and C on the excited bins."""
+        """Bases of A, B and C on the driven bins."""
         at = self.excited_at
         of_a, of_c = self.denominator_basis.values[at], self.transient_on_bins[at]
         return of_a, self.numerator_basis.values, of_c

@@ -20,7 +20,7 @@ from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Solution, minimise, refit_failed
 from tactile_resonance.poles.joint_noise import TINY, rules_between, with_noise
 from tactile_resonance.poles.judgement import Judged
-from tactile_resonance.poles.lacking import asks, lacking_terms
+from tactile_resonance.poles.lacking import Lack, asks
 from tactile_resonance.poles.levels import Level, Levels, line_pieces, smooth_variance
 from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.model_error import systematic_of
@@ -257,20 +257,19 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     level = Level.of(plan, solution, fitted.noise, fitted.kind == 2)
     residual = solution.residual[:, 0] * (1 / np.sqrt(level.scale))[:, None]
     suspect = are_smooth(residual, plan.structure.parameters) | level.suspect
-    lacking = np.full((batch, 3), np.nan)
     asked = _may_return(solution)
     if batch > 1:
         asked &= suspect | asks(plan, level.cost, level.expected, residual)
-    if asked.any():
-        rows = np.flatnonzero(asked)
-        part = data if rows.size == batch else data.rows(rows)
-        lacking[rows] = lacking_terms(plan, part, theta[rows], inverse[rows], solution.cost[rows])
-        suspect = suspect | np.isfinite(lacking[:, 0])
-    if suspect.any():  # what rounding leaves of exact data says nothing
-        rows = np.flatnonzero(suspect)
+    lack = Lack.of(plan, data, solution, asked)
+    suspect = suspect | np.isfinite(lack.found[:, 0])
+    doubted = suspect | (lack.chi_square > 0)
+    if doubted.any():  # what rounding leaves of exact data says nothing
+        rows = np.flatnonzero(doubted)
         of_noise = (level.scale * data.variance_y.min(axis=1))[rows]
-        suspect[rows] = of_noise > ROUNDED * _mean_power(data.rows(rows))
-        lacking[~suspect] = np.nan
+        doubted[rows] = of_noise > ROUNDED * _mean_power(data.rows(rows))
+        suspect &= doubted
+        lack.found[~suspect] = np.nan
+    lack = lack.only_where(doubted & ~suspect)
     # others are fitted once more
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
@@ -291,8 +290,9 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         kind=fitted.kind,
         level_known=np.full(batch, known),
         noise_variance=level.noise,
-        systematic=systematic_of(plan, data, solution.theta, wrong),
-        lacking=lacking,
+        systematic=systematic_of(plan, data, solution.theta, wrong) + lack.doubt,
+        lacking=lack.found,
+        remark=lack.remarks,
     )
 
 
@@ -364,6 +364,9 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     if suspect.any():
         suspect &= fitted.more_than_rounding(levels.excited)
     suspect |= levels.contradicts
+    asked = _may_return(solution) & (suspect | (batch == 1))
+    lack = Lack.of(plan, fitted.data, solution, asked & fitted.more_than_rounding(levels.excited))
+    suspect |= np.isfinite(lack.found[:, 0])
     covariance, total = fitted.covariances(suspect)
     theta = solution.theta
     judged = Judged.of(
@@ -383,8 +386,15 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
         kind=fitted.kind,
         noise_variance=fitted.noise * levels.noise_level(suspect)[0][:, None],
         systematic=systematic_of(plan, fitted.data, theta, suspect),
+        lacking=lack.found,
     )
-    return _each_by_itself(judged, total, first)
+    judged = _each_by_itself(judged, total, first)
+    lack = lack.only_where(~judged.suspect)
+    return replace(
+        judged,
+        systematic=judged.systematic + lack.doubt,
+        remark=np.where(judged.remark == "", lack.remarks, judged.remark),
+    )
 
 
 def _each_by_itself(fit: Judged, total: FloatArray, first: _Round) -> Judged:

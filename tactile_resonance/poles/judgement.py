@@ -70,8 +70,8 @@ class Judged:
     noise_variance : (batch, 2) float
         Variance of a bin of Y and of U; NaN where the data brought their own.
     systematic : (batch, places, 2, 2) float
-        What a model error moves (f0_hz, damping_ratio) by, as an outer product, and what else adds to the
-        total covariance; 0 where nothing does.
+        What a model error, or what the model may lack, moves (f0_hz, damping_ratio) by, as an outer product,
+        and what else adds to the total covariance; 0 where nothing does.
     lacking : (batch, 3) float
         See `PolesBatch`.
     dispensable : (batch, places) bool
@@ -111,7 +111,8 @@ class Judged:
         }
         for name in nothing.keys() - values.keys():
             values[name] = np.full(*nothing[name])
-        return cls(lines=lines, remark=np.full(batch, "", object), **values)
+        values.setdefault("remark", np.full(batch, "", object))
+        return cls(lines=lines, **values)
 
     def put(self, rows: IntArray, others: Judged) -> None:
         """Write other points in place of some."""
@@ -122,7 +123,7 @@ class Judged:
     def total_with_model_error(self) -> tuple[IntArray, FloatArray]:
         """Points of which more than noise is known, and their total covariances, with the model error."""
         if self.total is None:
-            rows = np.flatnonzero(self.suspect)
+            rows = np.flatnonzero(self.suspect | self.systematic.any(axis=(1, 2, 3)))
             total = self.covariance[rows]
         else:
             rows, total = np.arange(self.lines.size), self.total
@@ -347,7 +348,7 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         values = array[index][there]
         return values if values.size and np.isfinite(values).all() else None
 
-    said = [_sentence(batch, index, status), str(batch.remark[index]), *notes]
+    said = [_sentence(batch, index, status), *notes, str(batch.remark[index])]
     message = "; ".join(filter(None, said))
     return Poles(
         poles_rad_s=poles,

@@ -6,27 +6,38 @@ residuals along such a direction that the fit's own coefficients cannot take up 
 fall by in the richer fit, which need not be made (Rao, *Linear Statistical Inference and Its
 Applications*, 2nd ed. (1973), section 6e). The pole of another mode is searched for on a grid; the
 threshold allows for the number of trials.
+
+A test finds an error of the model only where that is large beside the noise. Residual terms that are
+missing may move poles by several deviations before. So where noise makes the cost fall by as much only once
+in `1 / DOUBT` fits, what two terms more would move the poles by counts in the total covariance.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.fit import Solution
+from tactile_resonance.poles.modes import pole_quantities
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
+    from tactile_resonance.poles.plan import FitPlan
 
 
 # How often each of the two tests finds something lacking in a model that is complete.
 FALSE_ALARM = 2e-4
+# How often two residual terms more are doubted to be noise in such a model.
+DOUBT = 0.05
 # Part of a direction's power that a fit must leave for it to be tried.
 LEAST_LEFT = 1e-8
 # Half widths of the modes tried: from the spacing of the lines to this part of the band. Wider ones are
@@ -34,6 +45,8 @@ LEAST_LEFT = 1e-8
 WIDEST = 1 / 8
 # Distance of the modes tried, in half widths.
 GRID = 1.5
+# Lines times modes that are tried, the widest ones: 64 MB.
+MOST_TRIED = 2_000_000
 # Points of a batch are asked where the cost is so many standard deviations above its expectation or,
 # where there is no cost, the residuals are this smooth (as a normal score): of clean ones 3 in a hundred.
 COST_ASKS, SMOOTHNESS_ASKS = 2.0, 1.5
@@ -71,7 +84,8 @@ class Directions:
             The variable of the model there.
         numerator_order : int
         """
-        pole = poles_tried(frequency_hz)
+        tried = poles_tried(frequency_hz)  # the widest last
+        pole = tried[-max(MOST_TRIED // frequency_hz.size, 1) :]
         s = 2j * np.pi * frequency_hz[:, None]
         above, below = 1 / (s - pole), 1 / (s - pole.conj())
         phi = np.stack([above + below, 1j * (above - below)], axis=-1)  # (K, N, 2)
@@ -100,7 +114,7 @@ def poles_tried(frequency_hz: FloatArray) -> ComplexArray:
 def asks(
     plan: JointPlan, cost: FloatArray, expected: FloatArray, residual: ComplexArray
 ) -> BoolArray:
-    """(batch,) for which points of a batch `lacking_terms` is worth its time.
+    """(batch,) for which points of a batch `Lack.of` is worth its time.
 
     Parameters
     ----------
@@ -116,87 +130,147 @@ def asks(
     return np.asarray(cost > expected + COST_ASKS * np.sqrt(expected * (1 + expected / others)))
 
 
-@np.errstate(all="ignore")
-def lacking_terms(
-    plan: JointPlan,
-    data: BinData,
-    theta: FloatArray,
-    inverse: FloatArray,
-    cost: FloatArray,
-) -> FloatArray:
-    """What the model of fitted points lacks.
+@dataclass(frozen=True, eq=False)
+class Lack:
+    """What the models of fitted points lack.
 
-    Parameters
+    Attributes
     ----------
-    plan : JointPlan
-    data : BinData
-        Of one record each.
-    theta : (batch, n) float
-        The fit.
-    inverse : (batch, n, n) float
-        Of its normal matrices.
-    cost : (batch,) float
-        Of all bins.
-
-    Returns
-    -------
-    (batch, 3) float
+    found : (batch, 3) float
         Chi-square of what is lacking, its number of parameters, and f0 [Hz] of the mode, NaN for
-        residual terms; all NaN where nothing is lacking.
-
-    Notes
-    -----
-    The level of the noise is what the residuals of all bins have besides that direction, so that each
-    direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
-    exceeded by chance with ``(1 - R)^(dof - 1)``.
+        residual terms; all NaN where nothing is.
+    doubt : (batch, places, 2, 2) float
+        Second moments of what two residual terms more move (f0_hz, damping_ratio) by; 0 where noise
+        explains them.
+    chi_square : (batch,) float
+        Of these two terms; 0 where noise explains them.
     """
-    directions = plan.directions
-    dof = data.undriven + data.driven - theta.shape[1] / 2
-    fall = _falls(data, plan.driven_bases, theta, inverse, directions.numerator, directions.modes)
-    found = np.full((len(fall), 3), np.nan)
-    least = 1 - FALSE_ALARM ** (1 / max(dof - 1, 0.5))  # of the cost: chance makes it fall by less
-    for k in np.flatnonzero((fall > least * cost[:, None]).any(axis=1)):
-        chance = (dof - 1) * np.log1p(-fall[k] / cost[k])
-        chance[1:] += np.log(max(directions.poles_rad_s.size, 1))
-        chance[np.isnan(chance)] = 0.0
-        best = np.argmin(chance)
-        if chance[best] < np.log(FALSE_ALARM):
-            found[k, 0] = 2 * fall[k, best] * (dof - 1) / (cost[k] - fall[k, best])
-            found[k, 1] = 2.0 if best == 0 else 4.0
-            if best > 0:
-                found[k, 2] = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi)
-    return found
+
+    found: FloatArray
+    doubt: FloatArray
+    chi_square: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        plan: FitPlan,
+        data: BinData,
+        solution: Solution,
+        asked: BoolArray,
+        least: FloatArray | None = None,
+    ) -> Lack:
+        """Of the points that are asked (batch,); nothing of the others.
+
+        Parameters
+        ----------
+        plan, data, solution
+            The fit.
+        asked : (batch,) bool
+        least : (batch,) float, optional
+            Of the level of the noise over that weighted with, where it is known beforehand; 0 when absent.
+        """
+        batch, places = asked.size, plan.structure.order // 2
+        lack = cls(np.full((batch, 3), np.nan), np.zeros((batch, places, 2, 2)), np.zeros(batch))
+        rows = asked.nonzero()[0]
+        if rows.size:
+            if rows.size < batch:
+                data, solution = data.rows(rows), solution.rows(rows)
+            known = None if least is None else least[rows]
+            lack._search(rows, plan, data, solution, known)
+        return lack
+
+    def only_where(self, sound: BoolArray) -> Lack:
+        """Without the doubt about other points (batch,)."""
+        if not self.chi_square.any():
+            return self
+        doubt = np.where(sound[:, None, None, None], self.doubt, 0.0)
+        return replace(self, doubt=doubt, chi_square=np.where(sound, self.chi_square, 0.0))
+
+    @property
+    def remarks(self) -> npt.NDArray[np.object_]:
+        """(batch,) sentences about points that are in doubt; else empty."""
+        said = np.full(self.chi_square.size, "", object)
+        for k in self.chi_square.nonzero()[0]:
+            said[k] = (
+                f"two residual terms more fit slightly better (chi-square {self.chi_square[k]:.1f}), as where "
+                "modes outside the band matter: the total covariance includes what they move the poles by"
+            )
+        return said
+
+    @np.errstate(all="ignore")
+    def _search(
+        self,
+        rows: IntArray,
+        plan: FitPlan,
+        data: BinData,
+        solution: Solution,
+        least: FloatArray | None,
+    ) -> None:
+        """Fill in points, whose data and fits these are.
+
+        Notes
+        -----
+        The level of the noise is what the residuals of all bins have besides that direction, so that each
+        direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
+        exceeded by chance with ``(1 - R)^(dof - 1)``.
+        """
+        directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
+        bases, modes = plan.driven_bases, directions.modes
+        fall, taken, left = _falls(data, bases, solution.theta, inverse, directions.numerator, modes)
+        used = data.driven * np.isfinite(data.variance_y).mean(axis=1)
+        dof = data.records * (data.undriven + used) - inverse.shape[-1] / 2  # (batch,)
+        rest, cost = np.maximum(dof - 1, 0.5), solution.cost
+        in_doubt = fall[:, 0] > (1 - DOUBT ** (1 / rest)) * cost
+        in_doubt |= fall.max(axis=1) > (1 - FALSE_ALARM ** (1 / rest)) * cost
+        for k in in_doubt.nonzero()[0]:
+            level = (cost[k] - fall[k]) / rest[k]
+            if least is not None:
+                level = np.maximum(level, least[k])
+            chance, at = -rest[k] * np.log1p(fall[k] / (rest[k] * level)), rows[k]
+            chance[np.isnan(chance)] = 0.0
+            if chance[0] < math.log(DOUBT):
+                own, taken_up = left[k, :, :2], inverse[k] @ taken[k].T  # (n, 2)
+                size = np.linalg.solve(own, left[k, :, 2])  # of the two terms
+                moment = 0.5 * level[0] * np.linalg.inv(own) + np.outer(size, size)
+                moved = (taken_up @ moment @ taken_up.T)[None]
+                model = plan.model_of(solution.theta[k : k + 1, 0])
+                self.doubt[at] = pole_quantities(model, plan.band_hz, moved)[0]["covariance"][0]
+                self.chi_square[at] = 2 * fall[k, 0] / level[0]
+            chance[1:] += math.log(max(len(modes), 1))
+            best = int(np.argmin(chance))
+            if chance[best] < math.log(FALSE_ALARM):
+                f0_hz = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi) if best else np.nan
+                self.found[at] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
 
 
 @entry
 def _falls(data, bases, theta, inverse, numerator, modes):
     """(points, 1 + N) what costs fall by with two residual terms more, or with each of N modes.
 
-    Of fitted points (points, n) of one record, with `bases` of A, B and C on driven bins. 0 where the fit has
-    taken a direction up already.
+    Of fitted points, theta (points, M, s + c), with `bases` of A, B and C on driven bins and the `inverse`
+    (points, n, n) of the normal matrix of all n = s + M c coefficients. 0 where these have taken a direction
+    up already. And of the two terms products with the coefficients (points, 2, n), and with each other and the
+    error (points, 2, 3), less what the coefficients take up.
     """
     basis_a, basis_b, basis_c = bases
-    points, n = theta.shape
-    bins, a, b = basis_a.shape[0], basis_a.shape[1] - 1, basis_b.shape[1]
+    points, records, _ = theta.shape
+    n, bins, c = inverse.shape[1], basis_a.shape[0], basis_c.shape[1]
+    a, b = basis_a.shape[1] - 1, basis_b.shape[1]
     own, slope, power = np.empty((n, 2, bins)), np.empty((2, bins)), np.empty(bins)
-    pair, crossed = np.empty((2, 2, bins)), np.empty((2, n))
+    pair, crossed, rest = np.empty((2, 2, bins)), np.empty((2, n)), np.empty((2, 3))
     falls, same_y, same_u = np.empty((points, 1 + modes.shape[0])), data.variance_y, data.variance_u
-    same_yu = data.covariance_yu
+    taken, left, same_yu = np.empty((points, 2, n)), np.empty((points, 2, 3)), data.covariance_yu
     for point in range(points):
+        same = min(point, data.u.shape[0] - 1)
         for k in range(bins):
             place = data.order[data.undriven + k]
-            y, u = data.y[point, 0, place], data.u[point, 0, place]
-            of_a, of_b, of_c = basis_a[k, a], 0j, 0j
+            of_a, of_b = basis_a[k, a], 0j
             for i in range(a):
-                of_a += theta[point, i] * basis_a[k, i]
+                of_a += theta[point, 0, i] * basis_a[k, i]
             for i in range(b):
-                of_b += theta[point, a + i] * basis_b[k, i]
-            for i in range(n - a - b):
-                of_c += theta[point, a + b + i] * basis_c[k, i]
+                of_b += theta[point, 0, a + i] * basis_b[k, i]
             inverse_a = 1 / of_a
-            g = of_b * inverse_a
-            model = g * u + of_c * inverse_a
-            error, half = y - model, 0j  # half the derivative of the variance by g
+            g, half = of_b * inverse_a, 0j  # half the derivative of the variance by g
             variance = same_y[point, min(k, same_y.shape[1] - 1)]
             if same_u.shape[1] > 0:
                 half += same_u[point, min(k, same_u.shape[1] - 1)] * g.conjugate()
@@ -205,32 +279,43 @@ def _falls(data, bases, theta, inverse, numerator, modes):
                 variance -= (covariance * g.conjugate()).real
                 half -= covariance.conjugate()
             weight = 1 / (variance + (half * g).real)
-            # what a response more takes off half the cost
-            squared = error.real * error.real + error.imag * error.imag
-            value = weight * (error.conjugate() * u + weight * squared * half)
-            slope[0, k], slope[1, k] = value.real, value.imag
-            power[k] = weight * (u.real * u.real + u.imag * u.imag)
-            for i in range(n):
-                if i < a:
-                    value = -model * basis_a[k, i]
-                elif i < a + b:
-                    value = u * basis_b[k, i - a]
-                else:
-                    value = basis_c[k, i - a - b]
-                value *= weight * inverse_a * u.conjugate()
+            # what a response more takes off half the cost, and products of responses of A and B with it
+            off, with_a, with_b = 0j, 0j, 0.0
+            for m in range(records):
+                y, u = data.y[point, m, place], data.u[same, m, place]
+                of_c = 0j
+                for i in range(c):
+                    of_c += theta[point, m, a + b + i] * basis_c[k, i]
+                model = g * u + of_c * inverse_a
+                error = y - model
+                squared = error.real * error.real + error.imag * error.imag
+                off += error.conjugate() * u + weight * squared * half
+                with_a -= model * u.conjugate()
+                with_b += u.real * u.real + u.imag * u.imag
+                for i in range(c):
+                    value = weight * inverse_a * u.conjugate() * basis_c[k, i]
+                    own[a + b + m * c + i, 0, k], own[a + b + m * c + i, 1, k] = value.real, value.imag
+            slope[0, k], slope[1, k], power[k] = weight * off.real, weight * off.imag, weight * with_b
+            for i in range(a + b):
+                value = with_a * basis_a[k, i] if i < a else with_b * basis_b[k, i - a]
+                value *= weight * inverse_a
                 own[i, 0, k], own[i, 1, k] = value.real, value.imag
             for r in range(2):
                 value = numerator[k, r] * inverse_a
                 pair[r, 0, k], pair[r, 1, k] = value.real, value.imag
-        falls[point, 0] = _fall(pair, own, slope, power, inverse[point], crossed)
+        falls[point, 0] = _fall(pair, own, slope, power, inverse[point], crossed, rest)
+        taken[point], left[point] = crossed, rest
         for m in range(modes.shape[0]):
-            falls[point, 1 + m] = _fall(modes[m], own, slope, power, inverse[point], crossed)
-    return falls
+            falls[point, 1 + m] = _fall(modes[m], own, slope, power, inverse[point], crossed, rest)
+    return falls, taken, left
 
 
 @inner
-def _fall(pair, own, slope, power, inverse, crossed):
-    """What the cost falls by along a pair of responses (2, 2, K), real and imaginary parts."""
+def _fall(pair, own, slope, power, inverse, crossed, rest):
+    """What the cost falls by along a pair of responses (2, 2, K), real and imaginary parts.
+
+    And the products of `_falls`, into `crossed` (2, n) and `rest` (2, 3).
+    """
     n, bins = own.shape[0], power.size
     p_00 = p_01 = p_11 = s_0 = s_1 = 0.0
     for k in range(bins):
@@ -252,6 +337,8 @@ def _fall(pair, own, slope, power, inverse, crossed):
             left_00 -= crossed[0, i] * inverse[i, j] * crossed[0, j]
             left_01 -= crossed[0, i] * inverse[i, j] * crossed[1, j]
             left_11 -= crossed[1, i] * inverse[i, j] * crossed[1, j]
+    rest[0, 0], rest[0, 1], rest[0, 2] = left_00, left_01, s_0
+    rest[1, 0], rest[1, 1], rest[1, 2] = left_01, left_11, s_1
     determinant = left_00 * left_11 - left_01 * left_01
     if not determinant > LEAST_LEFT * p_00 * p_11:
         return 0.0

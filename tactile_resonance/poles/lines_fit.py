@@ -25,6 +25,7 @@ from tactile_resonance.poles.fit import (
     linear_step,
     minimise,
 )
+from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.starts import (
@@ -106,6 +107,17 @@ class LinesPlan(FitPlan):
         """Driven bins without a transient."""
         none = np.empty((self.frequency_hz.size, 0), complex)
         return Problem(self.denominator_basis.values, self.numerator_basis.values, none)
+
+    @cached_property
+    def directions(self) -> Directions:
+        """What a richer model has in addition, on the lines."""
+        x = self.variable.of_frequency(self.frequency_hz)
+        return Directions.on_lines(self.frequency_hz, x, self.structure.numerator_order)
+
+    @property
+    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Bases of A and B on the lines; there is no C."""
+        return self.problem.denominator, self.problem.numerator, self.problem.transient
 
     @cached_property
     def delay_unit_s(self) -> float:

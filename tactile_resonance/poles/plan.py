@@ -28,6 +28,8 @@ from tactile_resonance.poles.tables import Problem
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from tactile_resonance.poles.lacking import Directions
+
 # Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
 # in particular.
 COMPARISON = RULES._replace(iterations=8)
@@ -64,6 +66,16 @@ class FitPlan(ABC):
     @abstractmethod
     def problem(self) -> Problem:
         """What the fit is made of."""
+
+    @property
+    @abstractmethod
+    def directions(self) -> Directions:
+        """What a richer model has in addition, on the driven bins."""
+
+    @property
+    @abstractmethod
+    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Bases of A, B and C on the driven bins."""
 
     @abstractmethod
     def with_structure(self, structure: ModelStructure) -> Self | None:

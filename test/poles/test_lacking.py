@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a model lacks is told where neither cost nor smoothness of the residuals shows it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -13,10 +15,12 @@ from benchmarks.poles_plant import (
     Plant,
 )
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.fit import minimise
+from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.judgement import single
-from tactile_resonance.poles.lacking import lacking_terms
-from tactile_resonance.poles.likelihood import invert, moments
+from tactile_resonance.poles.lacking import DOUBT, FALSE_ALARM, Lack
+from tactile_resonance.poles.lines_fit import LinesPlan
+from tactile_resonance.poles.modes import pole_quantities
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -125,9 +129,99 @@ def test_a_complete_model_lacks_nothing(cell, structure):
         variance_y=variance_y,
         variance_u=variance_u,
     )
-    theta = np.concatenate(theta, axis=1)
-    cost, _, normal = moments(plan.problem.tables, data, theta[:, None])
-    inverse, _ = invert(normal[:, 0].sum(axis=1))
-    lacking = lacking_terms(plan, data, theta, inverse, cost.sum(axis=1))
-    alarms = np.isfinite(lacking[:, 0]).sum()
-    assert stats.binom.sf(alarms - 1, runs, 4e-4) > 0.0005
+    assert_nothing_lacks(plan, data, np.concatenate(theta, axis=1)[:, None])
+
+
+@pytest.mark.parametrize(("records", "periods"), [(4, 1), (2, 2)])
+def test_a_complete_model_of_several_realisations_lacks_nothing(records, periods):
+    """Their transients take up a little of every direction, which the tests allow for."""
+    plan, u, y = realisations(2000, records, periods, 20.0)
+    assert_nothing_lacks(plan, BinData.of(y, u, plan.order, plan.other_bins.size))
+
+
+def test_a_complete_model_of_an_frf_lacks_nothing():
+    lines_hz = np.arange(200.0, 300.1, 2.5)
+    rng = np.random.default_rng(4)
+    noise = rng.standard_normal((2, 4000, lines_hz.size))
+    g = response(lines_hz, 250.0, 0.02) + 0.01 * (noise[0] + 1j * noise[1]) / np.sqrt(2)
+    plan = LinesPlan.on_lines(lines_hz, ModelStructure(), (200.0, 300.0))
+    data = BinData.of(g[:, None], np.ones((1, 1, lines_hz.size)), variance_y=np.full((4000, 1), 1e-4))
+    assert_nothing_lacks(plan, data)
+
+
+def assert_nothing_lacks(plan, data, start=None):
+    """False alarms and doubts are as frequent as stated."""
+    solution, runs = minimise(plan.problem, data, start), len(data.y)
+    lack = Lack.of(plan, data, solution, np.ones(runs, bool))
+    alarms = np.isfinite(lack.found[:, 0]).sum()
+    assert stats.binom.sf(alarms - 1, runs, 2 * FALSE_ALARM) > 0.0005
+    doubts = (lack.chi_square > 0).sum()
+    assert 0.0005 < stats.binom.cdf(doubts, runs, DOUBT) < 0.9995
+    assert not lack.doubt[lack.chi_square == 0].any()
+
+
+def response(frequency_hz, f0_hz, damping_ratio):
+    """(K,) of a mode of peak 1."""
+    s, w = 2j * np.pi * frequency_hz, 2 * np.pi * f0_hz
+    width = 2 * damping_ratio * w
+    return width * w / (s**2 + width * s + w**2)
+
+
+def realisations(runs, records, periods, snr_db, beside=()):
+    """Plan and bins u, y (runs, M, K) of a mode at 250 Hz and others, from any initial state."""
+    kind = JointPlan if records == 1 else PoleEstimator
+    plan = kind(5e3, 2000, periods, np.arange(4, 401), (200.0, 300.0), transient_terms=8)
+    hz, rng = plan.frequency_hz(plan.bins), np.random.default_rng(11)
+    u = np.zeros((runs, records, hz.size), complex)
+    phase = 2 * np.pi * rng.random((runs, records, plan.excited_at.size))
+    u[..., plan.excited_at] = np.exp(1j * phase)
+    noise = rng.standard_normal((2, *u.shape))
+    y = 10 ** (-snr_db / 20) * (noise[0] + 1j * noise[1]) / np.sqrt(2)
+    for f0_hz, damping_ratio, size in ((250.0, 0.04, 1.0), *beside):
+        started = rng.standard_normal((2, runs, records, 1)) / periods
+        transient = (started[0] + 1j * hz / f0_hz * started[1]) / f0_hz * response(hz, f0_hz, 0.04)
+        y += size * (response(hz, f0_hz, damping_ratio) * u + transient)
+    return plan, u, y
+
+
+BESIDE = ((120.0, 0.04, 0.5), (400.0, 0.04, 0.5))
+
+
+@pytest.mark.parametrize(("records", "periods"), [(1, 4), (4, 1), (3, 2)])
+def test_doubt_is_what_a_fit_with_two_terms_more_differs_by(records, periods):
+    """Its coefficients and their covariance, which one step along these terms finds."""
+    runs = 40
+    plan, u, y = realisations(runs, records, periods, 60.0, BESIDE)
+    richer = replace(plan, structure=ModelStructure.with_residual(2, 8))
+    data = BinData.of(y, u, plan.order, plan.other_bins.size)
+    fit, more = minimise(plan.problem, data), minimise(richer.problem, data)
+    lack = Lack.of(plan, data, fit, np.ones(runs, bool))
+    rows = np.flatnonzero(lack.chi_square > 12)
+    assert rows.size > 10
+    level = (2 * (fit.cost - more.cost) / np.maximum(lack.chi_square, 1))[:, None, None]
+    (poles, covariance), (of_more, wider) = (of_solution(p, s) for p, s in ((plan, fit), (richer, more)))
+    moved = of_more - poles
+    expected = 0.5 * level * (wider - covariance) + moved[:, :, None] * moved[:, None, :]
+    assert np.median(np.abs(lack.doubt[rows, 0] / expected[rows] - 1)) < 0.1
+
+
+def of_solution(plan, solution):
+    """(runs, 2) of (f0_hz, damping_ratio), and the covariance for noise of variance 2."""
+    q, _ = pole_quantities(plan.model_of(solution.theta[:, 0]), plan.band_hz, solution.marginal[:, 0])
+    return np.stack([q["f0_hz"][:, 0], q["damping_ratio"][:, 0]], axis=-1), q["covariance"][:, 0]
+
+
+@pytest.mark.parametrize(("records", "periods"), [(4, 1), (3, 2)])
+def test_modes_beyond_the_band_count_where_no_test_finds_them(records, periods):
+    """Half as large, at 120 and 400 Hz: the ellipses of noise alone of poles with status ok miss the mode."""
+    plan, u, y = realisations(150, records, periods, 56.0, BESIDE)
+    inside = []
+    for k in range(150):
+        poles = single(plan.from_bins(u[k], y[k]))
+        off = np.array([poles.f0_hz[0] - 250, poles.damping_ratio[0] - 0.04])
+        if poles.status is PolesStatus.OK:
+            matrices = poles.covariance[0], poles.best_covariance[0]
+            inside.append([off @ np.linalg.solve(matrix, off) < 5.991 for matrix in matrices])
+    assert len(inside) > 30
+    by_noise, in_total = np.mean(inside, axis=0)
+    assert by_noise < 0.6 < 0.75 < in_total
