@@ -125,6 +125,10 @@ def analyse(
     if poles_method == "joint" and channel_delay_s:
         raise ValueError("poles_method: joint takes no channel delay, use frf")
     warnings = list(recording.notes)
+    if recording.copied:
+        warnings.append(
+            "y: all periods are copies of the first, without noise between them: deviations say nothing"
+        )
     record = Spectrum.of(recording.u, recording.y)
     rate_hz, harmonics = recording.sample_rate_hz, recording.excited_harmonics
     start = time.perf_counter()

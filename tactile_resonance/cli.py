@@ -44,6 +44,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"tactile_resonance: {_one_line(error)}", file=sys.stderr)
         return 1
+    except ModuleNotFoundError as error:
+        if str(error.name).split(".")[0] != "rosbags":
+            raise
+        from tactile_resonance.front import WITHOUT_ROSBAGS
+
+        print(f"tactile_resonance: {WITHOUT_ROSBAGS}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt as error:
         print(f"tactile_resonance: interrupted{error}", file=sys.stderr)
         return 130

@@ -47,10 +47,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Identify, show how far it is, write both files, count."""
     # only here: the command answers --help without the library for recordings
-    try:
-        from tactile_resonance.scan.reidentify import reidentify
-    except ImportError as error:
-        raise ValueError(f"reidentify: {error.name} not found; pip install rosbags") from error
+    from tactile_resonance.scan.reidentify import reidentify
+
     order, terms = options.order, options.numerator_order
     require(order is not None or terms is None, "--numerator-order", terms, "one beside --order")
     structure = None if order is None else ModelStructure.with_residual(order)

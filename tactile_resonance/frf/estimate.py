@@ -199,7 +199,11 @@ def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
         given = conditional_variance(noise)
         variance_noise = error_variance(g, noise) / np.mean(power(each[..., 1, :]), axis=-2)
     frequency_hz = spectra.frequency_hz(sample_rate_hz)
-    status, message = _robust_status(each, spectra.covariance, g, g_each, frequency_hz)
+    differ = None
+    if variance_noise is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            differ = np.median(variance_total / variance_noise, axis=-1).reshape(-1)
+    status, message = _robust_status(each, spectra.covariance, g, g_each, frequency_hz, differ)
     return FRF(
         frequency_hz=frequency_hz,
         g=g,
@@ -285,6 +289,7 @@ def _robust_status(
     g: ComplexArray,
     g_each: ComplexArray,
     frequency_hz: FloatArray,
+    differ: FloatArray | None,
 ) -> tuple[FrfStatus, str]:
     where = transient_lines(each, g) if covariance is None else None
     if where is not None:
@@ -296,7 +301,7 @@ def _robust_status(
             "record two periods or more of each, or wait before the record",
         )
     g_each, u = (x.reshape(-1, *g_each.shape[-2:]) for x in (g_each, each[..., 1, :]))
-    remarks = list(filter(None, Agreement.of(g_each, u).remarks()))
+    remarks = list(filter(None, Agreement.of(g_each, u, differ).remarks()))
     if remarks:
         return FrfStatus.MODEL_ERROR, remarks[0]
     if covariance is not None:

@@ -26,6 +26,8 @@ MOST_GAIN = 1.25
 DEVIATIONS = 5.0
 # Squared coherence from which a ratio of powers is one of gains, and that of two that are alike.
 FOR_GAIN, ALIKE = 0.8, 0.5
+ABOVE_NOISE = 10.0
+"""What realisations differ by, over the power of the noise, from which noise is no reason for it."""
 # Lines over which neighbours are compared: a transient is at the modes.
 WINDOWS = (8, 32, 128)
 
@@ -44,15 +46,20 @@ class Agreement:
         Coherent, but of another gain.
     apart : (batch, M) bool
         Without coherence with any other realisation, two of which are coherent.
+    unlike : (batch,) bool
+        None coherent with any other, and noise is no reason for it.
     """
 
     gain: ComplexArray
     opposed: BoolArray
     unequal: BoolArray
     apart: BoolArray
+    unlike: BoolArray
 
     @classmethod
-    def of(cls, response: ComplexArray, u: ComplexArray) -> Agreement:
+    def of(
+        cls, response: ComplexArray, u: ComplexArray, differ: FloatArray | None = None
+    ) -> Agreement:
         """Of responses.
 
         Parameters
@@ -61,6 +68,8 @@ class Agreement:
             Of each realisation; lines without input, NaN, count as none.
         u : (batch or 1, M, F) complex
             Inputs: a line that is hardly driven shows noise.
+        differ : (batch,) float, optional
+            Power of what realisations differ by over that of the noise, where that is known.
 
         Notes
         -----
@@ -88,12 +97,24 @@ class Agreement:
         opposed = coherent & (np.abs(np.angle(h)) > MOST_PHASE_RAD + DEVIATIONS * deviation)
         high = coherent & (coherence > FOR_GAIN)
         unequal = high & (np.abs(np.log(np.abs(gain))) > np.log(MOST_GAIN) + DEVIATIONS * deviation)
-        return cls(gain, opposed, unequal, _apart(h, coherence, coherent, lines))
+        unlike = np.zeros(len(h), bool)
+        if differ is not None:
+            others = ~np.eye(records, dtype=bool)
+            mean = np.mean(coherence, axis=(1, 2), where=others)
+            spread = (1 - ALIKE) * np.sqrt(2 * ALIKE / (lines[:, 0, 0] * max(records - 1, 1)))
+            low = (mean < ALIKE - 3 * spread) & ~(coherent & others).any(axis=(1, 2))
+            unlike = low & (differ > ABOVE_NOISE)
+        return cls(gain, opposed, unequal, _apart(h, coherence, coherent, lines), unlike)
 
     @property
     def contradiction(self) -> BoolArray:
         """(batch,) whether the records are not of one system."""
-        return np.asarray(self._pairs.any(axis=(1, 2)) | self.apart.any(axis=-1))
+        return np.asarray(self._pairs.any(axis=(1, 2)) | self.apart.any(axis=-1) | self.unlike)
+
+    @property
+    def of_no_system(self) -> BoolArray:
+        """(batch,) whether the mean of the responses says nothing."""
+        return np.asarray(self.opposed.any(axis=(1, 2)) | self.unlike)
 
     def remarks(self) -> npt.NDArray[np.object_]:
         """(batch,) what contradicts, for people; empty where nothing does."""
@@ -108,6 +129,11 @@ class Agreement:
         return self.opposed | self.unequal
 
     def _remark(self, k: int) -> str:
+        if self.unlike[k]:
+            return (
+                "the responses of the realisations have nothing in common, which noise does not explain: "
+                "actuator and sensor are of different records, or distortion is larger than the response"
+            )
         pairs, apart = self._pairs[k], np.flatnonzero(self.apart[k])
         records = np.arange(len(pairs))
         if apart.size:

@@ -269,6 +269,7 @@ def _judged(
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
         kind = np.where(level_known, kind, len(KINDS))
     lack = lack.only_where(~suspect)
+    covariance, total = lack.with_doubt(covariance), total if total is None else lack.with_doubt(total)
     judged = Judged.of(
         plan,
         used,
@@ -283,7 +284,7 @@ def _judged(
         total=total,
         kind=kind,
         level_known=level_known,
-        systematic=systematic_of(plan, lines.data, fit.theta, suspect, of_fit) + lack.doubt,
+        systematic=systematic_of(plan, lines.data, fit.theta, suspect, of_fit),
         lacking=np.where(suspect[:, None], lack.found, np.nan),
         remark=lack.remarks,
         dispensable=of_fit.dispensable(lines.data, fit),

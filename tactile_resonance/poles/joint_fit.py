@@ -273,7 +273,7 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     # others are fitted once more
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
-    covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
+    covariance = lack.with_doubt(inverse * (0.5 * level.scale * level.correction)[:, None, None])
     known = plan.level_known
     return Judged.of(
         plan,
@@ -290,7 +290,7 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         kind=fitted.kind,
         level_known=np.full(batch, known),
         noise_variance=level.noise,
-        systematic=systematic_of(plan, data, solution.theta, wrong) + lack.doubt,
+        systematic=systematic_of(plan, data, solution.theta, wrong),
         lacking=lack.found,
         remark=lack.remarks,
     )
@@ -392,7 +392,8 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     lack = lack.only_where(~judged.suspect)
     return replace(
         judged,
-        systematic=judged.systematic + lack.doubt,
+        covariance=lack.with_doubt(judged.covariance),
+        total=lack.with_doubt(total if judged.total is None else judged.total),
         remark=np.where(judged.remark == "", lack.remarks, judged.remark),
     )
 
@@ -429,10 +430,10 @@ def _each_by_itself(fit: Judged, total: FloatArray, first: _Round) -> Judged:
     odd, remark = spread.remarks()
     wrong = np.zeros(odd.size, bool)
     for response in first.responses:
-        agreement = Agreement.of(response, first.data.u_driven)
+        agreement = Agreement.of(response, first.data.u_driven, levels.excited / levels.between)
         remark = np.where(agreement.contradiction, agreement.remarks(), remark)
         wrong |= agreement.contradiction
-        unknown = agreement.opposed.any(axis=(1, 2), keepdims=True)
+        unknown = agreement.of_no_system[:, None, None]
         if np.any(unknown):  # what is left of their mean is of no system
             covariance, total = (np.where(unknown, np.nan, one) for one in (covariance, total))
     return replace(

@@ -59,8 +59,8 @@ class Judged:
     suspect : (batch,) bool
         Whether cost, smoothness of the residuals or what the model lacks contradict the model.
     covariance : (batch, p, p) float
-        Of the coefficients from noise, of several records of those they share; NaN where noise cannot be
-        distinguished from all else.
+        Of the coefficients from noise, and from terms that may be missing (`lacking`), of several records of
+        those they share; NaN where noise cannot be distinguished from all else.
     total : same shape or None
         From noise and distortion; NaN where nothing but noise is known, None where that is so of all.
     kind : (batch,) int
@@ -70,8 +70,8 @@ class Judged:
     noise_variance : (batch, 2) float
         Variance of a bin of Y and of U; NaN where the data brought their own.
     systematic : (batch, places, 2, 2) float
-        What a model error, or what the model may lack, moves (f0_hz, damping_ratio) by, as an outer product,
-        and what else adds to the total covariance; 0 where nothing does.
+        What a model error moves (f0_hz, damping_ratio) by, as an outer product, and what else adds to the
+        total covariance; 0 where nothing does.
     lacking : (batch, 3) float
         See `PolesBatch`.
     dispensable : (batch, places) bool
@@ -123,7 +123,7 @@ class Judged:
     def total_with_model_error(self) -> tuple[IntArray, FloatArray]:
         """Points of which more than noise is known, and their total covariances, with the model error."""
         if self.total is None:
-            rows = np.flatnonzero(self.suspect | self.systematic.any(axis=(1, 2, 3)))
+            rows = np.flatnonzero(self.suspect)
             total = self.covariance[rows]
         else:
             rows, total = np.arange(self.lines.size), self.total

@@ -9,7 +9,7 @@ threshold allows for the number of trials.
 
 A test finds an error of the model only where that is large beside the noise. Residual terms that are
 missing may move poles by several deviations before. So where noise makes the cost fall by as much only once
-in `1 / DOUBT` fits, what two terms more would move the poles by counts in the total covariance.
+in `1 / DOUBT` fits, what two terms more would move the poles by counts in the covariance.
 """
 
 from __future__ import annotations
@@ -21,12 +21,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Solution
-from tactile_resonance.poles.modes import pole_quantities
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
@@ -139,16 +138,16 @@ class Lack:
     found : (batch, 3) float
         Chi-square of what is lacking, its number of parameters, and f0 [Hz] of the mode, NaN for
         residual terms; all NaN where nothing is.
-    doubt : (batch, places, 2, 2) float
-        Second moments of what two residual terms more move (f0_hz, damping_ratio) by; 0 where noise
-        explains them.
     chi_square : (batch,) float
-        Of these two terms; 0 where noise explains them.
+        Of two residual terms more; 0 where noise explains them.
+    doubt : (r, n, n) float
+        Of the points where it does not: second moments of what these terms move the coefficients [A without its
+        last, B, C of each record] by.
     """
 
     found: FloatArray
-    doubt: FloatArray
     chi_square: FloatArray
+    doubt: FloatArray
 
     @classmethod
     def of(
@@ -169,22 +168,29 @@ class Lack:
         least : (batch,) float, optional
             Of the level of the noise over that weighted with, where it is known beforehand; 0 when absent.
         """
-        batch, places = asked.size, plan.structure.order // 2
-        lack = cls(np.full((batch, 3), np.nan), np.zeros((batch, places, 2, 2)), np.zeros(batch))
-        rows = asked.nonzero()[0]
+        found, chi_square = np.full((asked.size, 3), np.nan), np.zeros(asked.size)
+        rows, doubt = asked.nonzero()[0], list[FloatArray]()
         if rows.size:
-            if rows.size < batch:
+            if rows.size < asked.size:
                 data, solution = data.rows(rows), solution.rows(rows)
             known = None if least is None else least[rows]
-            lack._search(rows, plan, data, solution, known)
-        return lack
+            found[rows], chi_square[rows], doubt = _search(plan, data, solution, known)
+        return cls(found, chi_square, np.array(doubt))
 
     def only_where(self, sound: BoolArray) -> Lack:
         """Without the doubt about other points (batch,)."""
-        if not self.chi_square.any():
+        if not len(self.doubt):
             return self
-        doubt = np.where(sound[:, None, None, None], self.doubt, 0.0)
-        return replace(self, doubt=doubt, chi_square=np.where(sound, self.chi_square, 0.0))
+        doubt = self.doubt[sound[self.chi_square > 0]]
+        return replace(self, chi_square=np.where(sound, self.chi_square, 0.0), doubt=doubt)
+
+    def with_doubt(self, covariance: FloatArray) -> FloatArray:
+        """Covariance (batch, p, p) of the first coefficients, with what two terms more move them by."""
+        if not len(self.doubt):
+            return covariance
+        covariance, p = covariance.copy(), covariance.shape[-1]
+        covariance[self.chi_square > 0] += self.doubt[:, :p, :p]
+        return covariance
 
     @property
     def remarks(self) -> npt.NDArray[np.object_]:
@@ -193,59 +199,59 @@ class Lack:
         for k in self.chi_square.nonzero()[0]:
             said[k] = (
                 f"two residual terms more fit slightly better (chi-square {self.chi_square[k]:.1f}), as where "
-                "modes outside the band matter: the total covariance includes what they move the poles by"
+                "modes outside the band matter: the covariance includes what they move the poles by"
             )
         return said
 
-    @np.errstate(all="ignore")
-    def _search(
-        self,
-        rows: IntArray,
-        plan: FitPlan,
-        data: BinData,
-        solution: Solution,
-        least: FloatArray | None,
-    ) -> None:
-        """Fill in points, whose data and fits these are.
 
-        Notes
-        -----
-        The level of the noise is what the residuals of all bins have besides that direction, so that each
-        direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
-        exceeded by chance with ``(1 - R)^(dof - 1)``.
-        """
-        directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
-        bases, modes = plan.driven_bases, directions.modes
-        fall, taken, left = _falls(data, bases, solution.theta, inverse, directions.numerator, modes)
-        used = data.driven * np.isfinite(data.variance_y).mean(axis=1)
-        dof = data.records * (data.undriven + used) - inverse.shape[-1] / 2  # (batch,)
-        rest, cost = np.maximum(dof - 1, 0.5), solution.cost
-        in_doubt = fall[:, 0] > (1 - DOUBT ** (1 / rest)) * cost
-        in_doubt |= fall.max(axis=1) > (1 - FALSE_ALARM ** (1 / rest)) * cost
-        for k in in_doubt.nonzero()[0]:
-            level = (cost[k] - fall[k]) / rest[k]
-            if least is not None:
-                level = np.maximum(level, least[k])
-            chance, at = -rest[k] * np.log1p(fall[k] / (rest[k] * level)), rows[k]
-            chance[np.isnan(chance)] = 0.0
-            if chance[0] < math.log(DOUBT):
-                own, taken_up = left[k, :, :2], inverse[k] @ taken[k].T  # (n, 2)
-                size = np.linalg.solve(own, left[k, :, 2])  # of the two terms
-                moment = 0.5 * level[0] * np.linalg.inv(own) + np.outer(size, size)
-                moved = (taken_up @ moment @ taken_up.T)[None]
-                model = plan.model_of(solution.theta[k : k + 1, 0])
-                self.doubt[at] = pole_quantities(model, plan.band_hz, moved)[0]["covariance"][0]
-                self.chi_square[at] = 2 * fall[k, 0] / level[0]
-            chance[1:] += math.log(max(len(modes), 1))
-            best = int(np.argmin(chance))
-            if chance[best] < math.log(FALSE_ALARM):
-                f0_hz = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi) if best else np.nan
-                self.found[at] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
+@np.errstate(all="ignore")
+def _search(
+    plan: FitPlan, data: BinData, solution: Solution, least: FloatArray | None
+) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
+    """What fitted points lack, as `Lack` has it.
+
+    Notes
+    -----
+    The level of the noise is what the residuals of all bins have besides that direction, so that each
+    direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
+    exceeded by chance with ``(1 - R)^(dof - 1)``.
+    """
+    directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
+    variance, cost = data.variance_y, solution.cost
+    used = np.isfinite(variance).sum(axis=1) * (data.driven // variance.shape[1])
+    dof = data.records * (data.undriven + used) - inverse.shape[-1] / 2  # (batch,)
+    rest, modes = np.maximum(dof - 1, 0.5), directions.modes
+    fall, asked, taken, left = _falls(
+        *(data, plan.driven_bases, solution.theta, inverse, directions.numerator, modes),
+        *(cost, 1 / rest),
+    )
+    found, chi_square = np.full((len(fall), 3), np.nan), np.zeros(len(fall))
+    doubt = []
+    for k in asked.nonzero()[0]:
+        level = (cost[k] - fall[k]) / rest[k]
+        if least is not None:
+            level = np.maximum(level, least[k])
+        chance = -rest[k] * np.log1p(fall[k] / (rest[k] * level))
+        chance[np.isnan(chance)] = 0.0
+        if chance[0] < math.log(DOUBT):
+            own, moved = left[k, :, :2], inverse[k] @ taken[k].T  # (n, 2)
+            size = np.linalg.solve(own, left[k, :, 2])  # of the two terms
+            moment = 0.5 * level[0] * np.linalg.inv(own) + np.outer(size, size)
+            doubt.append(moved @ moment @ moved.T)
+            chi_square[k] = 2 * fall[k, 0] / level[0]
+        chance[1:] += math.log(max(len(modes), 1))
+        best = int(np.argmin(chance))
+        if chance[best] < math.log(FALSE_ALARM):
+            f0_hz = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi) if best else np.nan
+            found[k] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
+    return found, chi_square, doubt
 
 
 @entry
-def _falls(data, bases, theta, inverse, numerator, modes):
+def _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance):
     """(points, 1 + N) what costs fall by with two residual terms more, or with each of N modes.
+
+    And where (points,) one of these is larger than noise makes it: rarer than `DOUBT`, or `FALSE_ALARM`.
 
     Of fitted points, theta (points, M, s + c), with `bases` of A, B and C on driven bins and the `inverse`
     (points, n, n) of the normal matrix of all n = s + M c coefficients. 0 where these have taken a direction
@@ -260,6 +266,7 @@ def _falls(data, bases, theta, inverse, numerator, modes):
     pair, crossed, rest = np.empty((2, 2, bins)), np.empty((2, n)), np.empty((2, 3))
     falls, same_y, same_u = np.empty((points, 1 + modes.shape[0])), data.variance_y, data.variance_u
     taken, left, same_yu = np.empty((points, 2, n)), np.empty((points, 2, 3)), data.covariance_yu
+    asked = np.empty(points, np.bool_)
     for point in range(points):
         same = min(point, data.u.shape[0] - 1)
         for k in range(bins):
@@ -305,9 +312,15 @@ def _falls(data, bases, theta, inverse, numerator, modes):
                 pair[r, 0, k], pair[r, 1, k] = value.real, value.imag
         falls[point, 0] = _fall(pair, own, slope, power, inverse[point], crossed, rest)
         taken[point], left[point] = crossed, rest
+        most = falls[point, 0]
         for m in range(modes.shape[0]):
-            falls[point, 1 + m] = _fall(modes[m], own, slope, power, inverse[point], crossed, rest)
-    return falls, taken, left
+            fall = _fall(modes[m], own, slope, power, inverse[point], crossed, rest)
+            falls[point, 1 + m] = fall
+            most = max(most, fall)
+        doubted = (1 - DOUBT ** power_of_chance[point]) * cost[point]
+        surely = (1 - FALSE_ALARM ** power_of_chance[point]) * cost[point]
+        asked[point] = falls[point, 0] > doubted or most > surely
+    return falls, asked, taken, left
 
 
 @inner

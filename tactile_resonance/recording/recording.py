@@ -57,7 +57,9 @@ class Recording:
     def require_driven(self) -> None:
         """Raise ``ValueError`` where no response can be estimated.
 
-        From one period alone, or where a channel is constant over a realisation: nothing was driven.
+        From one period alone, where a channel is constant over a realisation: nothing was driven, where a
+        realisation is a copy of the first, or where the actuator repeats after another number of samples than a
+        period has.
         """
         self.require_repeated()
         for name, samples in (("u", self.u), ("y", self.y)):
@@ -67,6 +69,23 @@ class Recording:
                     f"{name}: constant ({samples[np.argmax(flat)].flat[0]:g} V), expected a channel that "
                     "moves; of a record without drive: analyze --silent"
                 )
+        for m in range(1, len(self.y)):
+            if np.array_equal(self.y[m], self.y[0]):
+                raise ValueError(
+                    f"y: realisation {m + 1} is a copy of realisation 1, expected another record with phases "
+                    "of its own, or the record once"
+                )
+        repeats_after = _repeats_after(self.u[0])
+        if repeats_after:
+            raise ValueError(
+                f"samples_per_period: {self.u.shape[-1]}, but u repeats after {repeats_after} samples: "
+                "expected that number, or a multiple of it"
+            )
+
+    @property
+    def copied(self) -> bool:
+        """Whether all periods of the sensor are the same to the last bit: there is no noise to estimate."""
+        return self.y.shape[1] > 1 and bool(np.all(self.y == self.y[:, :1]))
 
 
 def make_recording(
@@ -141,6 +160,39 @@ def make_recording(
     for x, name in zip(channels, (u_name, y_name), strict=False):
         _check_samples(x, name)
     return Recording(channels[0], channels[1], rate_hz, _harmonics(excited_harmonics, n))
+
+
+# Part of the actuator's power that differs from period to period, from which another period is looked for, and
+# how much less must differ after that.
+DIFFERS, BETTER = 1e-4, 10.0
+
+
+def _repeats_after(u: npt.NDArray[np.floating]) -> int:
+    """Samples after which a record (P, N) repeats much better than after N; 0 where it does not."""
+    periods, n = u.shape
+    x = u.ravel() - u.mean()
+    power = np.cumsum(x * x)
+    if periods < 2 or not power[-1] > 0 or not np.isfinite(power[-1]):
+        return 0
+    differs = np.sum((x[n:] - x[:-n]) ** 2) / (power[-1] - power[n - 1] + power[-1 - n])
+    if not differs > DIFFERS:
+        return 0
+    size = x.size
+    spectrum = np.fft.rfft(x, 2 * size)
+    product = np.fft.irfft(spectrum.real**2 + spectrum.imag**2)[: size // 2 + size // 4]  # over lags
+    lags = np.arange(1, product.size)
+    after, before = power[-1] - power[lags - 1], power[size - lags - 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        alike = np.nan_to_num(product[1:] / np.sqrt(after * before))
+    low = np.flatnonzero(alike < 0.5)  # beyond it a lag is no mere smoothness
+    alike[: low[0] if low.size else None] = 0.0
+    best = alike.max()
+    if 1 - best > differs / BETTER:
+        return 0
+    near = np.flatnonzero(alike > best - differs / BETTER)
+    first = near[: np.argmax(np.append(np.diff(near), 2) > 1) + 1]  # around the smallest of its multiples
+    lag = int(lags[first[np.argmax(alike[first])]])
+    return 0 if lag == n else lag
 
 
 def _as_samples(values: npt.ArrayLike, name: str) -> npt.NDArray[np.floating]:

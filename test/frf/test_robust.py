@@ -221,3 +221,14 @@ def test_a_realisation_that_contradicts_the_others_is_named(fault, periods, ampl
     rest = [0, 2, 3]
     good = frf_of_record(Spectrum.of(u[rest], y[rest]), sample_rate_hz=1.0, harmonics=LINES)
     assert good.status is FrfStatus.OK
+
+
+@pytest.mark.parametrize("records", [2, 4])
+def test_actuator_and_sensor_of_different_records_are_named(records, multisine):
+    rng = np.random.default_rng(13)
+    u = np.repeat(multisine(LINES, SAMPLES, rng, records=(records, 1)), 2, axis=-2)
+    y = signal.lfilter(*SYSTEM, np.tile(u, (1, 2, 1)).reshape(records, -1)).reshape(records, 4, SAMPLES)
+    y = np.roll(y[:, 2:], 1, axis=0) + 0.01 * rng.standard_normal(u.shape)
+    result = frf_of_record(Spectrum.of(u, y), sample_rate_hz=1.0, harmonics=LINES)
+    assert result.status is FrfStatus.MODEL_ERROR
+    assert "have nothing in common" in result.message

@@ -126,6 +126,28 @@ def test_records_of_different_systems_are_no_certain_result(realisations, period
         assert judge(errors, total, np.eye(2))[1] > 0.9
 
 
+@pytest.mark.parametrize("realisations", [2, 3, 4, 8])
+def test_actuator_and_sensor_of_different_records_are_no_certain_result(realisations):
+    """Files in the wrong order: a third of such fits was ok, by up to 17 deviations off."""
+    all_plants = plants(0.02, 30.0, 2, realisations)
+    u, y = spectra(all_plants, np.random.default_rng(6), 50)
+    plan = plan_of(2, ModelStructure())
+    result = plan.from_bins(u, np.roll(y, 1, axis=1))
+    assert not result.has_status(PolesStatus.OK).any()
+    assert np.mean(["nothing in common" in remark for remark in result.remark]) > 0.95
+    assert np.isnan(result.total_covariance).all()
+
+
+def test_strong_distortion_is_no_other_system():
+    """6 dB below the response."""
+    all_plants = plants(0.02, 40.0, 2, 3)
+    clean = all_plants[0].noisy(np.random.default_rng(7), 1, all_plants[0].bins())[1]
+    level = float(np.mean(np.abs(clean[0, ::2]) ** 2)) / 4
+    u, y = spectra(all_plants, np.random.default_rng(8), RUNS, level)
+    found = ["nothing in common" in remark for remark in plan_of(2).from_bins(u, y).remark]
+    assert np.mean(found) < 0.005
+
+
 def test_transients_do_not_hide_that_records_are_of_different_systems():
     """Of a narrow mode and one period they take up what differs: off by up to eleven deviations."""
     all_plants = plants(0.005, 40.0, 1, 7)

@@ -136,6 +136,10 @@ def test_the_poles_are_those_of_analyze(runs, tmp_path, capsys, order):
             ),
         ):
             assert float(row[name]) == pytest.approx(of_pole, abs=0.01 * std)
+        assert float(row["cost"]) == pytest.approx(found["cost"], rel=2e-3)
+        if any("two residual terms more" in warning for warning in found["warnings"]):
+            assert float(row["f0_std_hz"]) < np.sqrt(best[0][0])  # not every point of many is tested for these
+            continue
         assert float(row["f0_std_hz"]) == pytest.approx(np.sqrt(best[0][0]), rel=2e-3)
         assert float(row["damping_ratio_std"]) == pytest.approx(np.sqrt(best[1][1]), rel=2e-3)
         cross = best[0][1] / np.sqrt(best[0][0] * best[1][1])
@@ -143,7 +147,6 @@ def test_the_poles_are_those_of_analyze(runs, tmp_path, capsys, order):
         # four poles on the one mode of several realisations: rounding moves it by a thousandth or two
         limit = 4e-3 if (order, row["index"]) == (4, "2") else 2e-3
         assert float(row["f0_damping_covariance_hz"]) / scale == pytest.approx(cross, abs=limit)
-        assert float(row["cost"]) == pytest.approx(found["cost"], rel=2e-3)
 
 
 def test_the_npz_holds_the_same_and_several_runs_go_into_one(runs, tmp_path):
