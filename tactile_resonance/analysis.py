@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.fields import band, known, number, require_kind
+from tactile_resonance.fields import band, known, number, require, require_kind
 from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.distortion import Distortion, estimate_distortion
 from tactile_resonance.frf.estimate import frf_of_record, with_narrow_modes_judged
@@ -117,6 +117,9 @@ def analyse(
     for candidate in candidates:
         require_kind(candidate, "candidates", ModelStructure)
     channel_delay_s = number(channel_delay_s, "channel_delay_s")
+    most_s = recording.u.shape[-1] / recording.sample_rate_hz / 2
+    accepted = f"up to half a period, {most_s:g} s, either way"
+    require(abs(channel_delay_s) <= most_s, "channel_delay_s", channel_delay_s, accepted)
     if band_hz is not None:
         band_hz = band(band_hz, most_hz=recording.sample_rate_hz / 2)
     if poles_method not in POLES_METHODS:
@@ -170,7 +173,9 @@ def analyse(
             record, sample_rate_hz=rate_hz, harmonics=harmonics, method=frf_method
         )
     if poles.status is PolesStatus.TOO_FEW_LINES:
-        raise ValueError(f"band_hz: {poles.message}")
+        first_hz, last_hz = frf.frequency_hz[[0, -1]]
+        excited = f"excited are lines from {first_hz:g} to {last_hz:g} Hz"
+        raise ValueError(f"band_hz: {poles.message}; {excited}")
     frf = with_narrow_modes_judged(faults.marked(frf))
     warnings += [
         f"{name}: {of.message}" for name, of in (("frf", frf), ("poles", poles)) if of.message

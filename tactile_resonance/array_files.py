@@ -165,6 +165,8 @@ def _read_csv(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
             dialect = csv.Sniffer().sniff(head, delimiters=",;\t")
             names = [name.strip() for name in next(csv.reader([head], dialect))]
             names[0] = names[0].removeprefix("#").strip()  # as numpy.savetxt marks a header
+            if all(_is_number(name) for name in names):
+                raise ValueError("its first line holds numbers")
             if len(set(names)) < len(names):
                 raise ValueError(f"columns named alike: {', '.join(names)}")
             if not (first := next(lines, "")):  # loadtxt warns and returns nothing
@@ -181,6 +183,14 @@ def _read_csv(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
         )
     of_names = zip(names, columns.T, strict=True)
     return {name: column for name, column in of_names if name in wanted}, names
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _lines(file: TextIO) -> Iterator[str]:

@@ -14,6 +14,8 @@ import scipy.fft
 from scipy import signal, special
 
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
+from tactile_resonance.frf.excited import find_excited_harmonics
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.tones import Tone, level_around
 
 MOST_SAMPLES = 2**18
@@ -28,6 +30,8 @@ MAIN_LOBE = 4
 FIRST_BIN = 16
 """Below, a drift is too steep to be compared with what is around."""
 MOST_NAMED = 12
+MOST_TONES = 40
+"""Of lines in an actuator record without drive: harmonics of the mains up to 2 kHz."""
 DRIVEN = 100
 """Power at excited lines over that between them, above which a record was not taken without drive."""
 
@@ -121,15 +125,16 @@ def silent_record(
     return SilentRecord(tuple(tones), noise[0], noise[1], (float(edges[0]), float(edges[1])))
 
 
-def check_undriven(u: npt.NDArray[np.floating], harmonics: IntArray) -> None:
-    """Refuse a record whose actuator was driven at the lines that it says are excited.
+def check_undriven(u: npt.NDArray[np.floating], harmonics: IntArray | None) -> None:
+    """Refuse a record whose actuator was driven.
 
     Parameters
     ----------
     u : (M, P, N) float
         Actuator [V]: M realisations of P consecutive periods. Of one period nothing lies between lines.
-    harmonics : (F,) int
-        Excited multiples of one over the period, ascending.
+    harmonics : (F,) int or None
+        Excited multiples of one over the period, ascending; None where they are not known: then there are more
+        lines than `MOST_TONES` where it was driven.
 
     Raises
     ------
@@ -139,6 +144,13 @@ def check_undriven(u: npt.NDArray[np.floating], harmonics: IntArray) -> None:
     realisations, periods, samples = u.shape
     if periods == 1:
         return
+    if harmonics is None:
+        try:
+            harmonics = find_excited_harmonics(Spectrum.of(u, u))
+        except ValueError:  # nothing stands above the noise
+            return
+        if harmonics.size <= MOST_TONES:
+            return
     spectrum = scipy.fft.rfft(u.reshape(realisations, periods * samples))
     power = np.mean(np.abs(spectrum) ** 2, axis=0)  # (K,), lines at multiples of the periods
     lines = harmonics * periods

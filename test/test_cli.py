@@ -21,6 +21,23 @@ def test_version_is_that_of_the_package(capsys):
     assert capsys.readouterr().out == f"tactile_resonance {version}\n"
 
 
+@pytest.mark.parametrize(
+    "command", [["plan", "scene.yaml"], ["mechanics", "RUN"], ["analyze", ".", "--point", "2"]]
+)
+def test_a_library_for_runs_that_is_missing_is_named(command):
+    code = """
+import sys
+sys.modules["rosbags"] = None
+from tactile_resonance.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "tactile_resonance: rosbags not found, which reads runs: pip install 'rosbags>=0.11.1,<0.12'\n"
+    )
+
+
 def test_compiling_is_announced_once_and_before_it_begins():
     """A cheap function in place of the kernels, compiled twice; what the cache holds is not announced."""
     code = """

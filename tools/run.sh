@@ -26,5 +26,6 @@ export OPENBLAS_NUM_THREADS="${OPENBLAS_NUM_THREADS:-1}"
 # of a run takes more than twice as long to start.
 export PYTHONPYCACHEPREFIX="${PYTHONPYCACHEPREFIX:-$root/build/pycache}"
 unset PYTHONDONTWRITEBYTECODE
+export TACTILE_RESONANCE_COMMAND="$0 tactile_resonance" # for messages that name a command
 
 exec "$@"

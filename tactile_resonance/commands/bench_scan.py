@@ -244,6 +244,9 @@ def run_job(job: Job) -> int:
         with NodeProcesses(work / "log") as nodes:
             nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
             result = _scan(nodes, job, ended)
+    except ScanRefused as error:
+        way_on = "" if job.resume else _way_on(job)  # the same once more would be refused as well
+        raise ValueError(f"{error} (logs in {work / 'log'}){way_on}") from error
     # the nodes have ended: whether a run was begun is certain now
     except (RuntimeError, ValueError) as error:
         raise ValueError(f"{error} (logs in {work / 'log'}){_way_on(job)}") from error
@@ -264,11 +267,16 @@ def run_job(job: Job) -> int:
     return 0 if result.done else 1
 
 
+class ScanRefused(ValueError):
+    """scan_node did not take the goal."""
+
+
 def _way_on(job: Job) -> str:
     """How a person goes on with a run that has ended early; empty where none was begun."""
     if not (job.output / "run.json").exists():
         return ""
-    return f"; tactile_resonance resume {job.output} goes on with the run"
+    command = os.environ.get("TACTILE_RESONANCE_COMMAND", "tactile_resonance")  # as a person calls it
+    return f"; {command} resume {job.output} goes on with the run"
 
 
 def require_own_domain() -> None:
@@ -362,10 +370,11 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
             result = client.scan(**goal, on_feedback=_shown_by(bar))
         stalls = client.details("fake_hardware_node").get("simulator stalls")
     if result.ending in (Ending.REJECTED, Ending.REFUSED, Ending.LOST):
-        raise ValueError(f"scan: {result.message}")
+        refused = result.ending in (Ending.REJECTED, Ending.REFUSED)
+        raise (ScanRefused if refused else ValueError)(f"scan: {result.message}")
     print(
         f"{result.message}: {result.done} points with poles, {result.failed} failed, {result.skipped} "
-        f"skipped; {counted(result.blocks, 'block')}, {result.blocks_saved} not needed ({result.saved_s:.1f} s)"
+        f"skipped; {counted(result.blocks, 'block')}, {result.blocks_saved} not taken ({result.saved_s:.1f} s)"
     )
     if stalls:
         print(f"the simulation itself stood still for more than 10 ms: {stalls} times")

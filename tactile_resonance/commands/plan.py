@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tactile_resonance.poles.result import Poles
+    from tactile_resonance.scan.decision import Decision
     from tactile_resonance.scan.plan import Plan
     from tactile_resonance.simulation.tissue.hertz import Tissue
     from tactile_resonance.simulation.tissue.scene import PhantomScene
@@ -76,6 +77,8 @@ def read_phantoms(path: Path) -> PhantomScene | None:
 
 def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
     """Precision and blocks at the first point of each tissue, as the simulated bench measures them."""
+    from tactile_resonance.scan.decision import Verdict
+
     if phantoms is None:
         return [
             "precision unknown: the scene has no regions to try it on; a simulated scan needs them"
@@ -86,8 +89,8 @@ def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
         if tissue is None or tissue.name in tried:
             continue
         tried.add(tissue.name)
-        poles, count = _rehearsed(plan, tissue)
-        blocks.append(count)
+        poles, decision = _rehearsed(plan, tissue)
+        blocks.append(decision.blocks)
         found = ", ".join(
             f"f0 {of.main.f0_hz:.2f} +- {of.main.std[0]:.2g} Hz, damping ratio "
             f"{of.main.damping_ratio:.5f} +- {of.main.std[1]:.1g}"
@@ -95,15 +98,17 @@ def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
             else f"no pole from {of.band_hz[0]:g} to {of.band_hz[1]:g} Hz: {of.status.value}"
             for of in poles.bands
         )
-        lines.append(f"on {tissue.name} (simulated) after {counted(count, 'block')}: {found}")
+        ended = "" if decision.verdict is Verdict.PRECISE else f"; {decision.verdict.value}"
+        after = counted(decision.blocks, "block")
+        lines.append(f"on {tissue.name} (simulated) after {after}: {found}{ended}")
     if blocks:
         mean = round(sum(blocks) / len(blocks))
         lines.append(f"time {plan.duration_s(mean):.0f} s")
     return lines or ["precision unknown: no point lies on a region of the scene"]
 
 
-def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, int]:
-    """Poles of one point measured block by block, and how many blocks that took."""
+def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, Decision]:
+    """Poles of one point measured block by block, and the decision that ended it."""
     from tactile_resonance.frf.measurement import MeasurementFrf
     from tactile_resonance.poles.estimator import poles_of_bands
     from tactile_resonance.scan.decision import decide
@@ -111,18 +116,18 @@ def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, int]:
     from tactile_resonance.simulation.sensor.bench import SimulatedBench
     from tactile_resonance.tissue.nominal_contact import ContactLoad
 
-    scene, design, frf, blocks = plan.scene, plan.measurement, MeasurementFrf(0), 0
+    scene, design, frf = plan.scene, plan.measurement, MeasurementFrf(0)
     pressed = ContactLoad(scene.force_n, 0.0, HELD_S)
     excitation = excitation_of(design, seed=1)
     bench = SimulatedBench.from_configuration()
     at_rest = bench.start(tissue, force_n=scene.force_n, hold_time_s=HELD_S, seed=1)
-    for record in at_rest.play(excitation, excitation.periods):
-        blocks += 1
+    for blocks, record in enumerate(at_rest.play(excitation, excitation.periods), 1):
         poles = poles_of_bands(frf.add(record, excitation), design.bands)
         wanted = scene.nominal_contact, blocks, scene.precision, design.blocks, design.block_s
-        if decide(poles, pressed, *wanted).stop:
+        decision = decide(poles, pressed, *wanted)
+        if decision.stop:
             break
-    return poles, blocks
+    return poles, decision
 
 
 def _draw(plan: Plan) -> Figure:

@@ -61,7 +61,8 @@ def check_goal(
     ):
         place = goal.touch.position_m + height * normal
         if (place < box.low_m).any() or (place > box.high_m).any():
-            raise ValueError(f"touch: its {name} {place} lies outside the workspace {box}")
+            ends = f"{box.low_m} to {box.high_m}"
+            raise ValueError(f"touch: its {name} {place} lies outside the workspace {ends}")
     if normal[2] < math.cos(limits.tilt_rad):
         raise ValueError(f"touch: tilted by more than tilt_rad = {limits.tilt_rad}")
     if tip is not None:

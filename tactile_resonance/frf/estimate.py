@@ -263,7 +263,8 @@ def with_narrow_modes_judged(frf: FRF) -> FRF:
         With (F,) arrays.
     """
     g, variance, lines = frf.g, frf.sensor_variance_given_actuator, frf.frequency_hz.size
-    if variance is None or lines < FEWEST_AROUND or frf.noise_dof < 2:
+    known = variance is not None and lines >= FEWEST_AROUND and frf.noise_dof >= 2
+    if variance is None or not known or frf.status is FrfStatus.MODEL_ERROR:
         return frf
     size, beside = np.abs(g), (g[:-2] + g[2:]) / 2
     peaks = np.zeros(lines, bool)

@@ -156,7 +156,7 @@ def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelSt
     count = int(((lines >= band_hz[0]) & (lines <= band_hz[1])).sum())
     if count <= structure.fewest_lines:
         return (
-            f"the band holds {count} excited lines, more than {structure.fewest_lines} are needed"
+            f"the band holds {count} excited lines, a record needs {structure.fewest_lines + 1}"
         )
     if structure.delay:
         return "it estimates no delay"

@@ -192,7 +192,7 @@ def _repeats_after(u: npt.NDArray[np.floating]) -> int:
     near = np.flatnonzero(alike > best - differs / BETTER)
     first = near[: np.argmax(np.append(np.diff(near), 2) > 1) + 1]  # around the smallest of its multiples
     lag = int(lags[first[np.argmax(alike[first])]])
-    return 0 if lag == n else lag
+    return 0 if n % lag == 0 else lag
 
 
 def _as_samples(values: npt.ArrayLike, name: str) -> npt.NDArray[np.floating]:

@@ -20,6 +20,7 @@ from tactile_resonance.report.page import map_entry, page, page_data, point_entr
 from tactile_resonance.report.paper_figures import paper_figures
 from tactile_resonance.report.point_details import PointDetails, lines_each
 from tactile_resonance.report.run_tables import SURE, Truths, repeats_sentence, table_notes
+from tactile_resonance.scan.decision import Verdict
 from tactile_resonance.scan.point_outcome import budget_sentence
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
@@ -195,6 +196,7 @@ def warnings_of(
             [r for r in measured if r.poles_status not in SURE],
             lambda r: r.poles_status,
         ),
+        ("precision out of reach", _out_of_reach(measured), lambda r: f"{counted(r.blocks, 'block')}"),
         ("force other than the scene's", off, lambda r: f"{1e3 * r.force_n:.2f} mN"),
         ("force not quiet at first", [r for r in measured if r.gate], lambda r: r.gate),
         (
@@ -243,6 +245,10 @@ def _not_tested(
     return why
 
 
+def _out_of_reach(results: Sequence[PointResult]) -> list[PointResult]:
+    return [result for result in results if result.verdict == Verdict.HOPELESS.value]
+
+
 def _force_is_off(result: PointResult, force_n: float) -> bool:
     """Whether the mean force differs from the scene's beyond its noise and by more than a share of it."""
     off_n = abs(result.force_n - force_n)
@@ -268,9 +274,11 @@ def summary(run: RunContent) -> list[str]:
     if saved:
         seconds = float(np.nansum([r.saved_s for r in run.latest]))
         lines.append(
-            f"{counted(blocks, 'block')} measured; {saved} more were allowed and not needed, "
+            f"{counted(blocks, 'block')} measured; {saved} more were allowed and not taken, "
             f"{seconds:.1f} s saved."
         )
+    if given_up := _out_of_reach(run.latest):
+        lines.append(f"Precision out of reach at {counted(len(given_up), 'point')}, which ended early.")
     if time := budget_sentence(run.latest):
         lines.append(time)
     classes = Counter(r.tissue_class for r in run.latest if r.tissue_class)

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from tactile_resonance.contact.admission import FORCE_SHARE
 from tactile_resonance.contact.force_spread import SHORTEST_S
+from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.fields import counted
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.decision import Precise, Separate
@@ -147,6 +150,20 @@ def _limits(plan: Plan) -> list[str]:
     if limits.point_s < point_s:
         texts.append(
             f"time_limits.point_s: {limits.point_s:g} s; a point takes {point_s:.1f} s or more and fails"
+        )
+    _, of_contact = read_contact()
+    most_n = FORCE_SHARE * of_contact.abort_force_n
+    if plan.scene.force_n > most_n * (1 + 1e-9):
+        texts.append(
+            f"force_n: {plan.scene.force_n:g} N, contact_node refuses more than two thirds of its "
+            f"limits.abort_force_n, by default {most_n:g} N: points fail"
+        )
+    away_m = max((math.hypot(*point.position_m[:2]) for point in plan.points), default=0.0)
+    most_m = math.hypot(*of_contact.workspace.high_m[:2])
+    if away_m > most_m:
+        texts.append(
+            f"positions: up to {away_m:.3g} m from the origin; contact_node's workspace ends at {most_m:.2g} m "
+            "from the robot's base by default: points fail; positions are in metres"
         )
     if level_v > MAX_LEVEL_V:
         texts.append(

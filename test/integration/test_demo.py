@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo as a user starts it: a whole scan, through robot, load cell and all nodes."""
 
+import os
 import re
 import signal
 import subprocess
@@ -83,7 +84,8 @@ def test_an_interrupted_scan_says_how_to_go_on_and_its_folder_is_taken(domain, t
     while not (run / "scene.yaml").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     errors = interrupt(demo, signal.SIGINT, domain)
-    end = f"interrupted; tactile_resonance resume {run} goes on with the run"
+    command = os.environ.get("TACTILE_RESONANCE_COMMAND", "tactile_resonance")
+    end = f"interrupted; {command} resume {run} goes on with the run"
     assert errors.splitlines()[-1] == f"tactile_resonance: {end}"
     again = subprocess.run(
         [*COMMAND, "--output", run], capture_output=True, text=True, timeout=HANGS_S, check=False

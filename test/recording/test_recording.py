@@ -109,6 +109,51 @@ def test_a_channel_without_drive_is_read_and_refused_where_a_drive_is_needed():
         silent.require_driven()
 
 
+def multisine(seed, periods, n=2000):
+    rng = np.random.default_rng(seed)
+    spectrum = np.zeros(n // 2 + 1, complex)
+    spectrum[60:161] = np.exp(2j * np.pi * rng.random(101)) * n / np.sqrt(2 * 101)
+    return np.tile(np.fft.irfft(spectrum, n), periods)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+@pytest.mark.parametrize("taken", [1600, 1000, 500, 1995, 3000])
+def test_a_period_that_is_not_that_of_the_actuator_is_named(taken, noise):
+    rng = np.random.default_rng(taken)
+    u = multisine(1, 12)
+    u = u + noise * rng.standard_normal(u.size)
+    u = u[: u.size // taken * taken]
+    recording = make_recording(u, np.cumsum(u), sample_rate_hz=5e3, samples_per_period=taken)
+    with pytest.raises(ValueError, match=f"{taken}, but u repeats after 2000 samples"):
+        recording.require_driven()
+
+
+@pytest.mark.parametrize("periods", [1, 2])
+@pytest.mark.parametrize("disturbed", ["noise", "hum", "drift", "gain", "aperiodic"])
+def test_what_disturbs_a_multisine_is_no_other_period(disturbed, periods):
+    rng, u = np.random.default_rng(2), multisine(1, 8)
+    time_s = np.arange(u.size) / 5e3
+    u = {
+        "noise": u + rng.standard_normal(u.size),
+        "hum": u + np.sin(2 * np.pi * 50.3 * time_s),
+        "drift": u + time_s,
+        "gain": u * (1 + 0.1 * (np.arange(u.size) // 2000)),
+        "aperiodic": rng.standard_normal(u.size),
+    }[disturbed]
+    y = u + rng.standard_normal(u.size)
+    make_recording(u, y, sample_rate_hz=5e3, samples_per_period=periods * 2000).require_driven()
+
+
+def test_copies_are_no_records():
+    rng, u = np.random.default_rng(3), multisine(1, 4).reshape(4, 2000)
+    y = u + rng.standard_normal(u.shape)
+    assert not make_recording(u, y, sample_rate_hz=5e3).copied
+    assert make_recording(u, np.tile(y[0], (4, 1)), sample_rate_hz=5e3).copied
+    twice = make_recording(np.stack([u, u]), np.stack([y, y]), sample_rate_hz=5e3)
+    with pytest.raises(ValueError, match="y: realisation 2 is a copy of realisation 1"):
+        twice.require_driven()
+
+
 @pytest.fixture
 def fields():
     return {"u": U, "y": Y, "sample_rate_hz": 10.0, "samples_per_period": 6}

@@ -125,6 +125,10 @@ def test_a_plan_names_each_limit_that_its_scan_would_meet():
     assert whole.startswith("time_limits.scan_s: 2 s are over before all points")
     assert point.startswith("time_limits.point_s: 0.5 s")
     assert level.startswith("sensor.level_v: ")
+    (force,) = told(replace(asked, force_n=0.5))["limit"]
+    assert force.startswith("force_n: 0.5 N, contact_node refuses more than")
+    limits = told(replace(asked, positions_m=1e3 * asked.positions_m))["limit"]
+    assert any(text.startswith("positions: up to 2 m from the origin") for text in limits)
 
 
 REGIONS = "regions: [{gelatine_percent: %s, disc: {center_m: [0, 0], radius_m: 0.02}}]\n"

@@ -115,7 +115,7 @@ def test_report_needs_nothing_else(run_folder, capsys):
     assert main(["report", str(run_folder)]) == 0
     printed = capsys.readouterr().out
     assert "25 of 25 points finished: 25 with poles, 0 failed, 0 skipped." in printed
-    assert re.search(r"\d+ blocks measured; \d+ more were allowed and not needed", printed)
+    assert re.search(r"\d+ blocks measured; \d+ more were allowed and not taken", printed)
     assert "Tissue is called from 25 poles at the nominal force and age of contact" in printed
     text = (run_folder / "report.html").read_text()
     assert "nominal f0 [Hz]" in text
