@@ -99,6 +99,12 @@ def test_a_header_without_numbers_is_refused_in_one_line(tmp_path):
             read_arrays(tmp_path / "a.csv", NAMES)
 
 
+def test_numbers_are_no_names_of_columns(tmp_path):
+    (tmp_path / "a.csv").write_text("0.1,1.0e-2\n0.2,2.0e-2\n")
+    with pytest.raises(ValueError, match="its first line holds numbers.*expected a header line"):
+        read_arrays(tmp_path / "a.csv", NAMES)
+
+
 def test_a_mat_file_is_read_where_memory_is_limited_already(tmp_path):
     pytest.importorskip("resource")
     scipy.io.savemat(tmp_path / "a.mat", {"u": np.arange(3)})
