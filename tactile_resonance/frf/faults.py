@@ -30,6 +30,9 @@ LARGE_OFFSET = 0.1
 """Mean against the rms of the rest."""
 LARGE_DRIFT = 0.05
 """Spread of the means of the periods against the rms of the rest."""
+FEWEST_LINES = 8
+LEAST_TURN, SPOILING_TURN = 1e-3, 0.1
+"""Phase [rad] that the actuator's highest line shifts by over a record: seen, and too far."""
 MAINS_HARMONICS = 5
 _HUM_FLOOR_BINS = (10, 40)  # distance from the mains frequency at which the floor is taken
 _FALSE_ALARM = 1e-4
@@ -40,6 +43,7 @@ class FaultKind(Enum):
 
     MISSING_SAMPLES = "missing samples"
     LOST_SAMPLES = "samples lost between periods"
+    CLOCKS = "clocks of generator and converter differ"
     SATURATION = "saturation"
     OFFSET = "offset"
     DRIFT = "drift"
@@ -416,7 +420,33 @@ def unsettled(x: _Channel) -> Fault | None:
     return x.fault(FaultKind.UNSETTLED, 10 ** (level / 20), True, text)
 
 
-CHECKS = (saturation, offset, drift, hum, lost_samples, unsettled)
+def clocks(x: _Channel) -> Fault | None:
+    """Periods of the actuator that shift by as much each, their phases in proportion to frequency."""
+    if x.name != "actuator" or x.periods < 2 or x.harmonics.size < FEWEST_LINES:
+        return None
+    lines, h = x.by_period[:, x.harmonics], x.harmonics.astype(float)
+    cross = lines[1:] * lines[:-1].conj()  # (P - 1, F)
+    whole = cross.sum(axis=0)
+    weight, phase = np.abs(whole), np.angle(whole)
+    if not np.sum(weight) > 0:
+        return None
+    slope = np.sum(weight * h * phase) / np.sum(weight * h**2)
+    rest = np.sum(weight * (phase - slope * h) ** 2) / np.sum(weight) * h.size / (h.size - 1)
+    std = np.sqrt(rest * np.sum((weight * h) ** 2)) / np.sum(weight * h**2)
+    turned = abs(slope) * h[-1] * (x.periods - 1)  # over the record, of the highest line
+    steady = np.sign(np.sum(np.imag(cross) * h, axis=-1)) == np.sign(slope)
+    if turned < LEAST_TURN or np.abs(phase).max() > 1 or abs(slope) < 6 * std or not steady.all():
+        return None
+    ppm = abs(slope) / (2 * np.pi) * 1e6
+    when = "early" if slope > 0 else "late"
+    text = (
+        f"Each period of the actuator comes {ppm:.3g} ppm of its length {when}: the generator's clock is not "
+        "the converter's"
+    )
+    return x.fault(FaultKind.CLOCKS, ppm, bool(turned > SPOILING_TURN), text)
+
+
+CHECKS = (saturation, offset, drift, hum, lost_samples, clocks, unsettled)
 """What is looked for in each channel that lacks no sample."""
 
 

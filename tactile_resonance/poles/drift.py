@@ -54,8 +54,8 @@ SHARE_OF_OTHERS = 0.01
 # would pass a limit of 1.
 MOST_OF_GAIN = 2.0
 GAIN_TOO = (
-    "the gain changes over the record as well, as where contact is lost: the drift is no property of "
-    "the mode"
+    "the gain changes over the record as well, as where contact is lost or clocks differ: the drift is no "
+    "property of the mode"
 )
 # Of the record, from -1 to 1, among which that is found where the change is nearest to its mean.
 TIMES = np.linspace(-1, 1, 2001)

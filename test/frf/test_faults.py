@@ -126,6 +126,29 @@ def test_noise_is_not_taken_for_lost_samples_and_lost_samples_are_seen_through_i
     assert seen(cut + (1 if lines is LINES else 0.1) * noise[1]) == ["(in 30 of 30 records)"]
 
 
+@pytest.mark.parametrize("periods", [2, 8])
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize("ppm", [0.0, 20.0, -20.0, 200.0])
+def test_clocks_that_differ(ppm, noise, periods):
+    """A generator that runs so much faster: each period comes early by as much."""
+    rng, harmonics = np.random.default_rng(1), np.arange(60, 161)
+    turns = harmonics[:, None] * (np.arange(periods * 2000) / 2000 * (1 + 1e-6 * ppm))
+    u = np.cos(2 * np.pi * (turns + rng.random((harmonics.size, 1)))).sum(axis=0)
+    u += noise * u.std() * rng.standard_normal(u.size)
+    u = u.reshape(periods, 2000)
+    record = Spectrum.of(u, u + 1e-3 * rng.standard_normal(u.shape))
+    report = find_faults(record, sample_rate_hz=5e3, harmonics=harmonics, transient_removed=True)
+    if ppm == 0:
+        assert FaultKind.CLOCKS not in report.kinds
+        return
+    fault = only(report, FaultKind.CLOCKS, "actuator")
+    assert fault.value == pytest.approx(abs(ppm), rel=0.1)
+    assert ("early" in fault.text) == (ppm > 0)
+    # 20 ppm of one period at 400 Hz are .02 rad, 200 ppm of seven 1.4 rad
+    if (abs(ppm), periods) in ((20.0, 2), (200.0, 8)):
+        assert fault.spoils == (periods == 8)
+
+
 def test_offset_and_drift(record):
     u, y = record
     fault = only(check(u, y + 1), FaultKind.OFFSET, "sensor")
