@@ -146,9 +146,8 @@ def _draw(plan: Plan) -> Figure:
         above.plot(*places_mm, ".", color="0.8", ms=2)
     above.plot(x_mm, y_mm, "-", color="0.7", lw=0.8)
     above.plot(x_mm, y_mm, "o", ms=5)
-    above.plot(x_mm[0], y_mm[0], "s", ms=9, mfc="none", color="C3", label="first")
-    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=title)
-    above.legend()
+    above.plot(x_mm[0], y_mm[0], "s", ms=9, mfc="none", color="C3")
+    above.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=f"{title}; square: the first")
     first = excitation_of(plan.measurement, seed=1)
     lines.vlines(first.frequency_hz, 0, 1e3 * first.amplitude_v, lw=0.8)
     for k, band in enumerate(plan.measurement.bands):

@@ -275,9 +275,8 @@ def read_store_recording(
     """
     entries, problems = list_measurements(folder)
     if not entries:
-        raise ValueError(
-            f"{folder}: no measurement in it, expected a folder of records {problems[:3]}"
-        )
+        found = f" ({'; '.join(problems[:3])})" if problems else ""
+        raise ValueError(f"{folder}: no measurement in it, expected a folder of records{found}")
     return recording_of(choose(entries, measurement_id, folder).read(), periods)
 
 

@@ -79,6 +79,7 @@ def draw_analysis(analysis: Analysis, title: str) -> Figure:
         xlabel="f0 [Hz]", ylabel="damping ratio", title=f"pole, status: {poles.status.value}"
     )
     pole_axes.ticklabel_format(useOffset=False)
+    pole_axes.locator_params(axis="x", nbins=3)  # six digits each
     if pole_axes.get_legend_handles_labels()[0]:
         pole_axes.legend(loc="best", fontsize="small")
     return figure
