@@ -269,7 +269,9 @@ def _judged(
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
         kind = np.where(level_known, kind, len(KINDS))
     lack = lack.only_where(~suspect)
-    covariance, total = lack.with_doubt(covariance), total if total is None else lack.with_doubt(total)
+    lack.add_doubt(covariance)
+    if total is not None and total is not covariance:
+        lack.add_doubt(total)
     judged = Judged.of(
         plan,
         used,

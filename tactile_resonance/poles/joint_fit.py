@@ -273,7 +273,8 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     # others are fitted once more
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
-    covariance = lack.with_doubt(inverse * (0.5 * level.scale * level.correction)[:, None, None])
+    covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
+    lack.add_doubt(covariance)
     known = plan.level_known
     return Judged.of(
         plan,
@@ -390,10 +391,11 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     )
     judged = _each_by_itself(judged, total, first)
     lack = lack.only_where(~judged.suspect)
+    lack.add_doubt(judged.covariance)
+    if judged.total is not None:
+        lack.add_doubt(judged.total)
     return replace(
         judged,
-        covariance=lack.with_doubt(judged.covariance),
-        total=lack.with_doubt(total if judged.total is None else judged.total),
         remark=np.where(judged.remark == "", lack.remarks, judged.remark),
     )
 

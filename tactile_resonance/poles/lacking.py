@@ -184,13 +184,11 @@ class Lack:
         doubt = self.doubt[sound[self.chi_square > 0]]
         return replace(self, chi_square=np.where(sound, self.chi_square, 0.0), doubt=doubt)
 
-    def with_doubt(self, covariance: FloatArray) -> FloatArray:
-        """Covariance (batch, p, p) of the first coefficients, with what two terms more move them by."""
-        if not len(self.doubt):
-            return covariance
-        covariance, p = covariance.copy(), covariance.shape[-1]
-        covariance[self.chi_square > 0] += self.doubt[:, :p, :p]
-        return covariance
+    def add_doubt(self, covariance: FloatArray) -> None:
+        """Add what two terms more move the first coefficients by to their covariance (batch, p, p)."""
+        if len(self.doubt):
+            p = covariance.shape[-1]
+            covariance[self.chi_square > 0] += self.doubt[:, :p, :p]
 
     @property
     def remarks(self) -> npt.NDArray[np.object_]:
