@@ -16,7 +16,7 @@ from scipy import signal, special
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.tones import Tone, level_around
+from tactile_resonance.tones import MAINS_HZ, Tone, level_around
 
 MOST_SAMPLES = 2**18
 """Of a piece; longer records are cut, and the powers of the pieces averaged."""
@@ -30,8 +30,6 @@ MAIN_LOBE = 4
 FIRST_BIN = 16
 """Below, a drift is too steep to be compared with what is around."""
 MOST_NAMED = 12
-MOST_TONES = 40
-"""Of lines in an actuator record without drive: harmonics of the mains up to 2 kHz."""
 DRIVEN = 100
 """Power at excited lines over that between them, above which a record was not taken without drive."""
 
@@ -125,7 +123,9 @@ def silent_record(
     return SilentRecord(tuple(tones), noise[0], noise[1], (float(edges[0]), float(edges[1])))
 
 
-def check_undriven(u: npt.NDArray[np.floating], harmonics: IntArray | None) -> None:
+def check_undriven(
+    u: npt.NDArray[np.floating], harmonics: IntArray | None, sample_rate_hz: float
+) -> None:
     """Refuse a record whose actuator was driven.
 
     Parameters
@@ -134,7 +134,8 @@ def check_undriven(u: npt.NDArray[np.floating], harmonics: IntArray | None) -> N
         Actuator [V]: M realisations of P consecutive periods. Of one period nothing lies between lines.
     harmonics : (F,) int or None
         Excited multiples of one over the period, ascending; None where they are not known: then there are more
-        lines than `MOST_TONES` where it was driven.
+        than `MOST_NAMED` that are no harmonics of the mains where it was driven.
+    sample_rate_hz : float
 
     Raises
     ------
@@ -142,14 +143,16 @@ def check_undriven(u: npt.NDArray[np.floating], harmonics: IntArray | None) -> N
         Where their power is more than `DRIVEN` times that between them.
     """
     realisations, periods, samples = u.shape
-    if periods == 1:
+    if periods == 1 or np.ptp(u) == 0:
         return
     if harmonics is None:
         try:
             harmonics = find_excited_harmonics(Spectrum.of(u, u))
         except ValueError:  # nothing stands above the noise
             return
-        if harmonics.size <= MOST_TONES:
+        line_hz = sample_rate_hz / samples
+        of_mains = [np.abs(harmonics * line_hz / hz % 1 - 0.5) > 0.5 - line_hz / hz for hz in MAINS_HZ]
+        if np.count_nonzero(~np.any(of_mains, axis=0)) <= MOST_NAMED:
             return
     spectrum = scipy.fft.rfft(u.reshape(realisations, periods * samples))
     power = np.mean(np.abs(spectrum) ** 2, axis=0)  # (K,), lines at multiples of the periods

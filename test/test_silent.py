@@ -82,9 +82,9 @@ def test_a_silent_record_needs_no_period(tmp_path, capsys):
 
 
 def test_a_driven_record_that_names_no_lines_is_refused_but_not_one_with_hum(tmp_path, capsys):
-    """Harmonics of the mains up to 2 kHz lie on the lines of this period."""
+    """Harmonics of the mains up to 2.45 kHz lie on the lines of this period."""
     rng, path = np.random.default_rng(6), tmp_path / "record.npz"
-    hum = tones(*((50.0 * k, 1e-3 / k) for k in range(1, 41)))
+    hum = tones(*((50.0 * k, 1e-3 / k) for k in range(1, 50)))
     multisine = tones(*((k * RATE_HZ / SAMPLES, 1e-3) for k in range(60, 161)))
     for u, status in ((hum, 0), (multisine, 1), (hum + multisine, 1)):
         fields = {"sample_rate_hz": RATE_HZ, "samples_per_period": SAMPLES}

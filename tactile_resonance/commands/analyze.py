@@ -249,7 +249,7 @@ def _run(options: argparse.Namespace) -> int:
         for name in ("json", "plot"):
             if getattr(options, name) is not None:
                 raise ValueError(f"--{name}: not with --silent, which prints")
-        check_undriven(recording.u, recording.excited_harmonics)
+        check_undriven(recording.u, recording.excited_harmonics, rate_hz)
         found = silent_record(recording.u, recording.y, sample_rate_hz=rate_hz, band_hz=band_hz)
         print(found.text())
         return 0

@@ -11,7 +11,7 @@ from scipy import special
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.poles.judgement import Judged, assemble, single
-from tactile_resonance.poles.lacking import Lack
+from tactile_resonance.poles.lacking import FEWEST_OF_A_LINE, Lack
 from tactile_resonance.poles.lines import (
     WeightedLines,
     checked_band,
@@ -252,6 +252,7 @@ def _judged(
     suspect = level_known & known.contradicts(cost, parameters, MODEL_ERROR_PROBABILITY)
     suspect |= are_smooth(residual, parameters)
     asked = fit.converged & (suspect | (used.size == 1)) & (not plan.structure.delay)
+    asked &= (known.kind < 2) | (known.dof >= FEWEST_OF_A_LINE)
     lack = Lack.of(of_fit, lines.data, fit, asked, np.where(level_known, 1.0, 0.0))
     suspect |= np.isfinite(lack.found[:, 0])
     kind = known.kind
@@ -269,9 +270,6 @@ def _judged(
         cost, expected = (np.where(level_known, x, np.nan) for x in (cost, expected))
         kind = np.where(level_known, kind, len(KINDS))
     lack = lack.only_where(~suspect)
-    lack.add_doubt(covariance)
-    if total is not None and total is not covariance:
-        lack.add_doubt(total)
     judged = Judged.of(
         plan,
         used,
@@ -288,6 +286,7 @@ def _judged(
         level_known=level_known,
         systematic=systematic_of(plan, lines.data, fit.theta, suspect, of_fit),
         lacking=np.where(suspect[:, None], lack.found, np.nan),
+        doubt=lack.doubt,
         remark=lack.remarks,
         dispensable=of_fit.dispensable(lines.data, fit),
     )

@@ -274,7 +274,6 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
     covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
-    lack.add_doubt(covariance)
     known = plan.level_known
     return Judged.of(
         plan,
@@ -293,6 +292,7 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         noise_variance=level.noise,
         systematic=systematic_of(plan, data, solution.theta, wrong),
         lacking=lack.found,
+        doubt=lack.doubt,
         remark=lack.remarks,
     )
 
@@ -365,7 +365,7 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     if suspect.any():
         suspect &= fitted.more_than_rounding(levels.excited)
     suspect |= levels.contradicts
-    asked = _may_return(solution) & (suspect | (batch == 1))
+    asked = _may_return(solution) & (suspect | (batch == 1)) & (fitted.kind < 2)
     lack = Lack.of(plan, fitted.data, solution, asked & fitted.more_than_rounding(levels.excited))
     suspect |= np.isfinite(lack.found[:, 0])
     covariance, total = fitted.covariances(suspect)
@@ -391,11 +391,9 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     )
     judged = _each_by_itself(judged, total, first)
     lack = lack.only_where(~judged.suspect)
-    lack.add_doubt(judged.covariance)
-    if judged.total is not None:
-        lack.add_doubt(judged.total)
     return replace(
         judged,
+        doubt=lack.doubt,
         remark=np.where(judged.remark == "", lack.remarks, judged.remark),
     )
 

@@ -59,8 +59,8 @@ class Judged:
     suspect : (batch,) bool
         Whether cost, smoothness of the residuals or what the model lacks contradict the model.
     covariance : (batch, p, p) float
-        Of the coefficients from noise, and from terms that may be missing (`lacking`), of several records of
-        those they share; NaN where noise cannot be distinguished from all else.
+        Of the coefficients from noise, of several records of those they share; NaN where noise cannot be
+        distinguished from all else.
     total : same shape or None
         From noise and distortion; NaN where nothing but noise is known, None where that is so of all.
     kind : (batch,) int
@@ -74,6 +74,9 @@ class Judged:
         total covariance; 0 where nothing does.
     lacking : (batch, 3) float
         See `PolesBatch`.
+    doubt : (batch,) object
+        What counts in the covariances of a point, but not for which of its modes are significant: (n, n) of
+        the coefficients, of which the first p belong to `covariance`; None: nothing. See `lacking.Lack`.
     dispensable : (batch, places) bool
         Modes without which the fit is as good; see `starts`.
     remark : (batch,) object
@@ -96,6 +99,7 @@ class Judged:
     systematic: FloatArray
     lacking: FloatArray
     dispensable: BoolArray
+    doubt: npt.NDArray[np.object_]
     remark: npt.NDArray[np.object_]
 
     @classmethod
@@ -111,6 +115,7 @@ class Judged:
         }
         for name in nothing.keys() - values.keys():
             values[name] = np.full(*nothing[name])
+        values.setdefault("doubt", np.full(batch, None, object))
         values.setdefault("remark", np.full(batch, "", object))
         return cls(lines=lines, **values)
 
@@ -188,6 +193,15 @@ def assemble(
     poles = quantities["poles_rad_s"]
     significant, distance = significant_modes(model, quantities, covariance, judged.lines)
     significant &= ~judged.dispensable
+    in_doubt = [k for k, matrix in enumerate(judged.doubt) if matrix is not None]
+    if in_doubt:
+        covariance = covariance.copy()
+        p = covariance.shape[-1]
+        doubt = np.stack([matrix[:p, :p] for matrix in judged.doubt[in_doubt]])
+        covariance[in_doubt] += doubt
+        of_poles, in_f0 = propagated(quantities["poles_rad_s"][in_doubt], sensitivity[in_doubt], doubt)
+        for name, more in (("pole_covariance", of_poles), ("covariance", in_f0), ("total_covariance", in_f0)):
+            quantities[name][in_doubt] += more
     if poles.shape[-1] > 2:
         significant &= ~_sum_of_hidden(poles, significant)
     if (less := plan.poorer) is not None:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
@@ -37,6 +37,10 @@ if TYPE_CHECKING:
 FALSE_ALARM = 2e-4
 # How often two residual terms more are doubted to be noise in such a model.
 DOUBT = 0.05
+# Of a fit: with fewer the residuals show no level of the noise.
+FEWEST_DOF = 3
+# Of variances that are from each line, or piece of the band, alone: with fewer the weights follow the noise.
+FEWEST_OF_A_LINE = 8
 # Part of a direction's power that a fit must leave for it to be tried.
 LEAST_LEFT = 1e-8
 # Half widths of the modes tried: from the spacing of the lines to this part of the band. Wider ones are
@@ -140,14 +144,14 @@ class Lack:
         residual terms; all NaN where nothing is.
     chi_square : (batch,) float
         Of two residual terms more; 0 where noise explains them.
-    doubt : (r, n, n) float
-        Of the points where it does not: second moments of what these terms move the coefficients [A without its
-        last, B, C of each record] by.
+    doubt : (batch,) object
+        Second moments (n, n) of what these terms move the coefficients by, [A without its last, B, C of each
+        record]; None where noise explains them.
     """
 
     found: FloatArray
     chi_square: FloatArray
-    doubt: FloatArray
+    doubt: npt.NDArray[np.object_]
 
     @classmethod
     def of(
@@ -168,27 +172,20 @@ class Lack:
         least : (batch,) float, optional
             Of the level of the noise over that weighted with, where it is known beforehand; 0 when absent.
         """
-        found, chi_square = np.full((asked.size, 3), np.nan), np.zeros(asked.size)
-        rows, doubt = asked.nonzero()[0], list[FloatArray]()
+        batch, rows = asked.size, asked.nonzero()[0]
+        lack = cls(np.full((batch, 3), np.nan), np.zeros(batch), np.full(batch, None, object))
         if rows.size:
-            if rows.size < asked.size:
+            if rows.size < batch:
                 data, solution = data.rows(rows), solution.rows(rows)
             known = None if least is None else least[rows]
-            found[rows], chi_square[rows], doubt = _search(plan, data, solution, known)
-        return cls(found, chi_square, np.array(doubt))
+            lack._search(rows, plan, data, solution, known)
+        return lack
 
     def only_where(self, sound: BoolArray) -> Lack:
         """Without the doubt about other points (batch,)."""
-        if not len(self.doubt):
-            return self
-        doubt = self.doubt[sound[self.chi_square > 0]]
+        doubt = self.doubt.copy()
+        doubt[~sound] = None
         return replace(self, chi_square=np.where(sound, self.chi_square, 0.0), doubt=doubt)
-
-    def add_doubt(self, covariance: FloatArray) -> None:
-        """Add what two terms more move the first coefficients by to their covariance (batch, p, p)."""
-        if len(self.doubt):
-            p = covariance.shape[-1]
-            covariance[self.chi_square > 0] += self.doubt[:, :p, :p]
 
     @property
     def remarks(self) -> npt.NDArray[np.object_]:
@@ -201,48 +198,49 @@ class Lack:
             )
         return said
 
+    @np.errstate(all="ignore")
+    def _search(
+        self,
+        rows: IntArray,
+        plan: FitPlan,
+        data: BinData,
+        solution: Solution,
+        least: FloatArray | None,
+    ) -> None:
+        """Fill in points, whose data and fits these are.
 
-@np.errstate(all="ignore")
-def _search(
-    plan: FitPlan, data: BinData, solution: Solution, least: FloatArray | None
-) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
-    """What fitted points lack, as `Lack` has it.
-
-    Notes
-    -----
-    The level of the noise is what the residuals of all bins have besides that direction, so that each
-    direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
-    exceeded by chance with ``(1 - R)^(dof - 1)``.
-    """
-    directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
-    variance, cost = data.variance_y, solution.cost
-    used = np.isfinite(variance).sum(axis=1) * (data.driven // variance.shape[1])
-    dof = data.records * (data.undriven + used) - inverse.shape[-1] / 2  # (batch,)
-    rest, modes = np.maximum(dof - 1, 0.5), directions.modes
-    fall, asked, taken, left = _falls(
-        *(data, plan.driven_bases, solution.theta, inverse, directions.numerator, modes),
-        *(cost, 1 / rest),
-    )
-    found, chi_square = np.full((len(fall), 3), np.nan), np.zeros(len(fall))
-    doubt = []
-    for k in asked.nonzero()[0]:
-        level = (cost[k] - fall[k]) / rest[k]
-        if least is not None:
-            level = np.maximum(level, least[k])
-        chance = -rest[k] * np.log1p(fall[k] / (rest[k] * level))
-        chance[np.isnan(chance)] = 0.0
-        if chance[0] < math.log(DOUBT):
-            own, moved = left[k, :, :2], inverse[k] @ taken[k].T  # (n, 2)
-            size = np.linalg.solve(own, left[k, :, 2])  # of the two terms
-            moment = 0.5 * level[0] * np.linalg.inv(own) + np.outer(size, size)
-            doubt.append(moved @ moment @ moved.T)
-            chi_square[k] = 2 * fall[k, 0] / level[0]
-        chance[1:] += math.log(max(len(modes), 1))
-        best = int(np.argmin(chance))
-        if chance[best] < math.log(FALSE_ALARM):
-            f0_hz = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi) if best else np.nan
-            found[k] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
-    return found, chi_square, doubt
+        Notes
+        -----
+        The level of the noise is what the residuals of all bins have besides that direction, so that each
+        direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
+        exceeded by chance with ``(1 - R)^(dof - 1)``.
+        """
+        directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
+        variance, cost = data.variance_y, solution.cost
+        used = np.isfinite(variance).sum(axis=1) * (data.driven // variance.shape[1])
+        dof = data.records * (data.undriven + used) - inverse.shape[-1] / 2  # (batch,)
+        rest, modes = np.maximum(dof - 1, 0.5), directions.modes
+        fall, asked, taken, left = _falls(
+            *(data, plan.driven_bases, solution.theta, inverse, directions.numerator, modes),
+            *(cost, 1 / rest),
+        )
+        for k in (asked & (dof > FEWEST_DOF)).nonzero()[0]:
+            level, at = (cost[k] - fall[k]) / rest[k], rows[k]
+            if least is not None:
+                level = np.maximum(level, least[k])
+            chance = -rest[k] * np.log1p(fall[k] / (rest[k] * level))
+            chance[np.isnan(chance)] = 0.0
+            if chance[0] < math.log(DOUBT):
+                own, moved = left[k, :, :2], inverse[k] @ taken[k].T  # (n, 2)
+                size = np.linalg.solve(own, left[k, :, 2])  # of the two terms
+                moment = 0.5 * level[0] * np.linalg.inv(own) + np.outer(size, size)
+                self.doubt[at] = moved @ moment @ moved.T
+                self.chi_square[at] = 2 * fall[k, 0] / level[0]
+            chance[1:] += math.log(max(len(modes), 1))
+            best = int(np.argmin(chance))
+            if chance[best] < math.log(FALSE_ALARM):
+                f0_hz = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi) if best else np.nan
+                self.found[at] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
 
 
 @entry

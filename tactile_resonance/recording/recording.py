@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -69,11 +70,11 @@ class Recording:
                     f"{name}: constant ({samples[np.argmax(flat)].flat[0]:g} V), expected a channel that "
                     "moves; of a record without drive: analyze --silent"
                 )
-        for m in range(1, len(self.y)):
-            if np.array_equal(self.y[m], self.y[0]):
+        for m, n in combinations(range(len(self.y)), 2):
+            if np.array_equal(self.y[m], self.y[n]):
                 raise ValueError(
-                    f"y: realisation {m + 1} is a copy of realisation 1, expected another record with phases "
-                    "of its own, or the record once"
+                    f"y: realisation {n + 1} is a copy of realisation {m + 1}, expected another record with "
+                    "phases of its own, or the record once"
                 )
         repeats_after = _repeats_after(self.u[0])
         if repeats_after:
@@ -165,12 +166,15 @@ def make_recording(
 # Part of the actuator's power that differs from period to period, from which another period is looked for, and
 # how much less must differ after that.
 DIFFERS, BETTER = 1e-4, 10.0
+# The same, of which a period is no whole one. A multisine with a tone beside it repeats best after several.
+UNLIKE = 0.5
 
 
 def _repeats_after(u: npt.NDArray[np.floating]) -> int:
     """Samples after which a record (P, N) repeats much better than after N; 0 where it does not."""
     periods, n = u.shape
-    x = u.ravel() - u.mean()
+    x = u.astype(float).ravel()
+    x -= x.mean()
     power = np.cumsum(x * x)
     if periods < 2 or not power[-1] > 0 or not np.isfinite(power[-1]):
         return 0
@@ -179,7 +183,8 @@ def _repeats_after(u: npt.NDArray[np.floating]) -> int:
         return 0
     size = x.size
     spectrum = np.fft.rfft(x, 2 * size)
-    product = np.fft.irfft(spectrum.real**2 + spectrum.imag**2)[: size // 2 + size // 4]  # over lags
+    most = max(size // 2, 3 * n // 2)  # beyond, little of the record is compared
+    product = np.fft.irfft(spectrum.real**2 + spectrum.imag**2)[:most]  # over lags
     lags = np.arange(1, product.size)
     after, before = power[-1] - power[lags - 1], power[size - lags - 1]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -192,7 +197,9 @@ def _repeats_after(u: npt.NDArray[np.floating]) -> int:
     near = np.flatnonzero(alike > best - differs / BETTER)
     first = near[: np.argmax(np.append(np.diff(near), 2) > 1) + 1]  # around the smallest of its multiples
     lag = int(lags[first[np.argmax(alike[first])]])
-    return 0 if n % lag == 0 else lag
+    if n % lag == 0 or (lag % n == 0 and differs < UNLIKE):
+        return 0
+    return lag
 
 
 def _as_samples(values: npt.ArrayLike, name: str) -> npt.NDArray[np.floating]:

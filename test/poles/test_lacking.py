@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a model lacks is told where neither cost nor smoothness of the residuals shows it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,10 @@ from benchmarks.poles_plant import (
     SAMPLES_PER_PERIOD,
     Plant,
 )
+from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import minimise
+from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.lacking import DOUBT, FALSE_ALARM, Lack
@@ -156,7 +159,7 @@ def assert_nothing_lacks(plan, data, start=None):
     assert stats.binom.sf(alarms - 1, runs, 2 * FALSE_ALARM) > 0.0005
     doubts = (lack.chi_square > 0).sum()
     assert 0.0005 < stats.binom.cdf(doubts, runs, DOUBT) < 0.9995
-    assert len(lack.doubt) == doubts
+    assert [matrix is not None for matrix in lack.doubt] == (lack.chi_square > 0).tolist()
 
 
 def response(frequency_hz, f0_hz, damping_ratio):
@@ -201,9 +204,8 @@ def test_doubt_is_what_a_fit_with_two_terms_more_differs_by(records, periods):
     grown = (more.marginal[:, 0, :2, :2] - fit.marginal[:, 0, :2, :2])[rows]
     level = 2 * (fit.cost - more.cost)[rows] / lack.chi_square[rows]
     expected = 0.5 * level[:, None, None] * grown + moved[:, :, None] * moved[:, None, :]
-    found = np.zeros((runs, 2, 2))
-    lack.add_doubt(found)
-    assert np.median(np.abs(found[rows] / expected - 1)) < 0.05
+    found = np.stack([lack.doubt[k][:2, :2] for k in rows])
+    assert np.median(np.abs(found / expected - 1)) < 0.05
 
 
 @pytest.mark.parametrize(("records", "periods"), [(4, 1), (3, 2)])
@@ -223,5 +225,41 @@ def test_modes_beyond_the_band_count_where_no_test_finds_them(records, periods, 
     with_doubt = inside()
     assert len(with_doubt) > 30
     assert np.mean(with_doubt) > 0.8
-    monkeypatch.setattr(Lack, "add_doubt", lambda *_: None)
+    monkeypatch.setattr(Lack, "only_where", lambda lack, _: replace(lack, doubt=np.full(1, None, object)))
     assert np.mean(inside()) < 0.7
+
+
+@pytest.mark.parametrize("of_frf", [False, True])
+def test_a_wide_mode_in_doubt_is_as_significant_as_before(of_frf, monkeypatch):
+    """Doubt widens its ellipse; a mode that noise would not make is still one."""
+    plant, found = Plant(0.15, 30.0, 2), []
+    u, y = plant.noisy(np.random.default_rng(9), 300, plant.bins())
+    plan, lines_hz = plan_for(plant), np.arange(200.0, 300.1, 2.5)
+    noise = np.random.default_rng(9).standard_normal((2, 300, lines_hz.size))
+    g = response(lines_hz, 250.0, 0.15) + 0.01 * (noise[0] + 1j * noise[1])
+    for k in range(300):
+        frf = FRF(lines_hz, g[k], variance_noise=np.full(lines_hz.size, 2e-4), noise_dof=4)
+        found.append(identify_frf(frf) if of_frf else single(plan.from_bins(u[k], y[k])))
+    assert sum("two residual terms" in poles.message for poles in found) > 5
+    assert all(poles.status is PolesStatus.OK for poles in found)
+
+
+@pytest.mark.parametrize("dof", [1, 2, 4])
+def test_variances_of_single_lines_from_few_periods_say_nothing_of_the_model(dof):
+    """As weights they follow the noise: of sound FRFs up to a quarter would lack a mode."""
+    lines_hz, rng = np.arange(200.0, 300.1, 2.5), np.random.default_rng(10)
+    true = 1e-4 * (1 + 100 * np.exp(-(((lines_hz - 262) / 4) ** 2)))
+    wrong = 0
+    for _ in range(200):
+        noise = rng.standard_normal((2, lines_hz.size))
+        g = response(lines_hz, 250.0, 0.02) + np.sqrt(true / 2) * (noise[0] + 1j * noise[1])
+        variance = true * rng.chisquare(2 * dof, lines_hz.size) / (2 * dof)
+        frf = FRF(lines_hz, g, variance_noise=variance, noise_dof=dof)
+        wrong += bool(re.search("(mode|terms) more", identify_frf(frf).message))
+    assert wrong < 6
+
+
+def test_a_fit_without_degrees_of_freedom_left_lacks_nothing():
+    lines_hz, rng = np.linspace(200.0, 300.0, 6), np.random.default_rng(11)
+    g = response(lines_hz, 250.0, 0.02) + 0.01 * rng.standard_normal(6)
+    assert "residual terms" not in identify_frf(FRF(lines_hz, g)).message

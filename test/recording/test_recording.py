@@ -129,19 +129,23 @@ def test_a_period_that_is_not_that_of_the_actuator_is_named(taken, noise):
 
 
 @pytest.mark.parametrize("periods", [1, 2])
-@pytest.mark.parametrize("disturbed", ["noise", "hum", "drift", "gain", "aperiodic"])
+@pytest.mark.parametrize("disturbed", ["noise", "hum", "hum that fits", "glitch", "drift", "gain", "aperiodic"])
 def test_what_disturbs_a_multisine_is_no_other_period(disturbed, periods):
     rng, u = np.random.default_rng(2), multisine(1, 8)
     time_s = np.arange(u.size) / 5e3
     u = {
         "noise": u + rng.standard_normal(u.size),
         "hum": u + np.sin(2 * np.pi * 50.3 * time_s),
+        "hum that fits": u + 0.05 * np.sin(2 * np.pi * 51.25 * time_s),  # after two periods
+        "glitch": u + 3.0 * (np.arange(u.size) == 8100),
         "drift": u + time_s,
         "gain": u * (1 + 0.1 * (np.arange(u.size) // 2000)),
         "aperiodic": rng.standard_normal(u.size),
     }[disturbed]
     y = u + rng.standard_normal(u.size)
-    make_recording(u, y, sample_rate_hz=5e3, samples_per_period=periods * 2000).require_driven()
+    for kind in (np.float64, np.float32):
+        record = make_recording(u.astype(kind), y, sample_rate_hz=5e3, samples_per_period=periods * 2000)
+        record.require_driven()
 
 
 def test_copies_are_no_records():
@@ -152,6 +156,9 @@ def test_copies_are_no_records():
     twice = make_recording(np.stack([u, u]), np.stack([y, y]), sample_rate_hz=5e3)
     with pytest.raises(ValueError, match="y: realisation 2 is a copy of realisation 1"):
         twice.require_driven()
+    other = make_recording(np.stack([-u, u, u]), np.stack([-y, y, y]), sample_rate_hz=5e3)
+    with pytest.raises(ValueError, match="y: realisation 3 is a copy of realisation 2"):
+        other.require_driven()
 
 
 @pytest.fixture
