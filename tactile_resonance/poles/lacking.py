@@ -183,6 +183,8 @@ class Lack:
 
     def only_where(self, sound: BoolArray) -> Lack:
         """Without the doubt about other points (batch,)."""
+        if not self.chi_square.any():
+            return self
         doubt = self.doubt.copy()
         doubt[~sound] = None
         return replace(self, chi_square=np.where(sound, self.chi_square, 0.0), doubt=doubt)
@@ -217,37 +219,51 @@ class Lack:
         """
         directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
         variance, cost = data.variance_y, solution.cost
-        used = np.isfinite(variance).sum(axis=1) * (data.driven // variance.shape[1])
+        used = np.full(cost.size, data.driven)
+        if variance.shape[1] > 1:
+            used = np.isfinite(variance).sum(axis=1)
         dof = data.records * (data.undriven + used) - inverse.shape[-1] / 2  # (batch,)
         rest, modes = np.maximum(dof - 1, 0.5), directions.modes
-        fall, asked, taken, left = _falls(
+        fall, doubted, asked, taken, left = _falls(
             *(data, plan.driven_bases, solution.theta, inverse, directions.numerator, modes),
             *(cost, 1 / rest),
         )
-        for k in (asked & (dof > FEWEST_DOF)).nonzero()[0]:
-            level, at = (cost[k] - fall[k]) / rest[k], rows[k]
-            if least is not None:
-                level = np.maximum(level, least[k])
+        enough = dof > FEWEST_DOF
+        for k in (asked & enough).nonzero()[0]:
+            level = _level(cost[k] - fall[k], rest[k], least, k)
             chance = -rest[k] * np.log1p(fall[k] / (rest[k] * level))
             chance[np.isnan(chance)] = 0.0
-            if chance[0] < math.log(DOUBT):
-                own, moved = left[k, :, :2], inverse[k] @ taken[k].T  # (n, 2)
-                size = np.linalg.solve(own, left[k, :, 2])  # of the two terms
-                moment = 0.5 * level[0] * np.linalg.inv(own) + np.outer(size, size)
-                self.doubt[at] = moved @ moment @ moved.T
-                self.chi_square[at] = 2 * fall[k, 0] / level[0]
             chance[1:] += math.log(max(len(modes), 1))
             best = int(np.argmin(chance))
             if chance[best] < math.log(FALSE_ALARM):
                 f0_hz = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi) if best else np.nan
-                self.found[at] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
+                self.found[rows[k]] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
+        some = (doubted & enough).nonzero()[0]
+        if some.size:
+            level, of_terms = _level((cost - fall[:, 0])[some], rest[some], least, some), fall[some, 0]
+            likely = rest[some] * np.log1p(of_terms / (rest[some] * level)) > -math.log(DOUBT)
+            some, level, of_terms = some[likely], level[likely], of_terms[likely]
+            own, moved = left[some, :, :2], inverse[some] @ taken[some].swapaxes(1, 2)  # (r, n, 2)
+            size = np.linalg.solve(own, left[some, :, 2:])  # (r, 2, 1) of the two terms
+            moment = 0.5 * level[:, None, None] * np.linalg.inv(own) + size * size.swapaxes(1, 2)
+            self.chi_square[rows[some]] = 2 * of_terms / level
+            for k, matrix in zip(rows[some], moved @ moment @ moved.swapaxes(1, 2), strict=True):
+                self.doubt[k] = matrix
+
+
+def _level(
+    left: FloatArray, rest: FloatArray, least: FloatArray | None, which: IntArray
+) -> FloatArray:
+    """Of the noise, from the cost that is left, where it is not known to be higher."""
+    level = left / rest
+    return level if least is None else np.maximum(level, least[which])
 
 
 @entry
 def _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance):
     """(points, 1 + N) what costs fall by with two residual terms more, or with each of N modes.
 
-    And where (points,) one of these is larger than noise makes it: rarer than `DOUBT`, or `FALSE_ALARM`.
+    And where (points,) the first is rarer than `DOUBT`, and where one of them is rarer than `FALSE_ALARM`.
 
     Of fitted points, theta (points, M, s + c), with `bases` of A, B and C on driven bins and the `inverse`
     (points, n, n) of the normal matrix of all n = s + M c coefficients. 0 where these have taken a direction
@@ -262,7 +278,7 @@ def _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance)
     pair, crossed, rest = np.empty((2, 2, bins)), np.empty((2, n)), np.empty((2, 3))
     falls, same_y, same_u = np.empty((points, 1 + modes.shape[0])), data.variance_y, data.variance_u
     taken, left, same_yu = np.empty((points, 2, n)), np.empty((points, 2, 3)), data.covariance_yu
-    asked = np.empty(points, np.bool_)
+    doubted, asked = np.empty(points, np.bool_), np.empty(points, np.bool_)
     for point in range(points):
         same = min(point, data.u.shape[0] - 1)
         for k in range(bins):
@@ -313,10 +329,9 @@ def _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance)
             fall = _fall(modes[m], own, slope, power, inverse[point], crossed, rest)
             falls[point, 1 + m] = fall
             most = max(most, fall)
-        doubted = (1 - DOUBT ** power_of_chance[point]) * cost[point]
-        surely = (1 - FALSE_ALARM ** power_of_chance[point]) * cost[point]
-        asked[point] = falls[point, 0] > doubted or most > surely
-    return falls, asked, taken, left
+        doubted[point] = falls[point, 0] > (1 - DOUBT ** power_of_chance[point]) * cost[point]
+        asked[point] = most > (1 - FALSE_ALARM ** power_of_chance[point]) * cost[point]
+    return falls, doubted, asked, taken, left
 
 
 @inner
