@@ -151,6 +151,7 @@ def check_undriven(
         except ValueError:  # nothing stands above the noise
             return
         line_hz = sample_rate_hz / samples
+        # within a line of a harmonic
         of_mains = [np.abs(harmonics * line_hz / hz % 1 - 0.5) > 0.5 - line_hz / hz for hz in MAINS_HZ]
         if np.count_nonzero(~np.any(of_mains, axis=0)) <= MOST_NAMED:
             return

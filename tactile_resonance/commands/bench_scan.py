@@ -369,9 +369,10 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
         with ProgressBar() as bar:
             result = client.scan(**goal, on_feedback=_shown_by(bar))
         stalls = client.details("fake_hardware_node").get("simulator stalls")
-    if result.ending in (Ending.REJECTED, Ending.REFUSED, Ending.LOST):
-        refused = result.ending in (Ending.REJECTED, Ending.REFUSED)
-        raise (ScanRefused if refused else ValueError)(f"scan: {result.message}")
+    if result.ending in (Ending.REJECTED, Ending.REFUSED):
+        raise ScanRefused(f"scan: {result.message}")
+    if result.ending is Ending.LOST:
+        raise ValueError(f"scan: {result.message}")
     print(
         f"{result.message}: {result.done} points with poles, {result.failed} failed, {result.skipped} "
         f"skipped; {counted(result.blocks, 'block')}, {result.blocks_saved} not taken ({result.saved_s:.1f} s)"

@@ -149,6 +149,19 @@ def test_clocks_that_differ(ppm, noise, periods):
         assert fault.spoils == (periods == 8)
 
 
+@pytest.mark.parametrize("lost", [0.2, 1.0])
+def test_a_shift_between_two_periods_is_no_clock(lost):
+    """Of a sample or a part of one, too little to be found as such."""
+    rng, harmonics = np.random.default_rng(2), np.arange(60, 161)
+    samples = np.arange(6 * 2000)
+    turns = harmonics[:, None] * (samples + lost * (samples >= 6000)) / 2000
+    u = np.cos(2 * np.pi * (turns + rng.random((harmonics.size, 1)))).sum(axis=0).reshape(6, 2000)
+    for _ in range(20):
+        record = Spectrum.of(u + 1e-3 * rng.standard_normal(u.shape), u)
+        report = find_faults(record, sample_rate_hz=5e3, harmonics=harmonics, transient_removed=True)
+        assert FaultKind.CLOCKS not in report.kinds
+
+
 def test_offset_and_drift(record):
     u, y = record
     fault = only(check(u, y + 1), FaultKind.OFFSET, "sensor")
