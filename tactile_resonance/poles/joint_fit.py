@@ -361,8 +361,8 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     batch, records, _ = solution.theta.shape
     a, b, own = plan.problem.sizes
     common = levels.common / np.sqrt(levels.excited)[:, None]
-    alike = np.mean(levels.common.real**2 + levels.common.imag**2, axis=-1)
-    noisy = fitted.more_than_rounding(np.maximum(alike, levels.excited))
+    # of exact data; what a wrong model leaves differs, too: each transient takes up another part of it
+    noisy = fitted.more_than_rounding(levels.excited)
     suspect = (are_smooth(common, plan.structure.parameters) | levels.contradicts) & noisy
     asked = _may_return(solution) & (suspect | (batch == 1)) & (fitted.kind < 2)
     lack = Lack.of(plan, fitted.data, solution, asked & noisy)

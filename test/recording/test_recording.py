@@ -128,6 +128,7 @@ def test_a_period_that_is_not_that_of_the_actuator_is_named(taken, noise):
         recording.require_driven()
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("periods", [1, 2])
 @pytest.mark.parametrize("disturbed", ["noise", "hum", "hum that fits", "glitch", "drift", "gain", "aperiodic"])
 def test_what_disturbs_a_multisine_is_no_other_period(disturbed, periods):
@@ -143,7 +144,7 @@ def test_what_disturbs_a_multisine_is_no_other_period(disturbed, periods):
         "aperiodic": rng.standard_normal(u.size),
     }[disturbed]
     y = u + rng.standard_normal(u.size)
-    for kind in (np.float64, np.float32):
+    for kind in (np.float64, np.float32, np.float16):
         record = make_recording(u.astype(kind), y, sample_rate_hz=5e3, samples_per_period=periods * 2000)
         record.require_driven()
 
