@@ -18,7 +18,6 @@ from tactile_resonance.poles.modes import (
     fall_of_noise,
     pole_quantities,
     propagated,
-    real_covariance,
     second_order,
     significant_modes,
 )
@@ -318,7 +317,7 @@ def _sum_of_hidden(poles: ComplexArray, significant: BoolArray) -> BoolArray:
 
 
 def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] = ()) -> Poles:
-    """One point of a batch, with the zeros and the sentence a batch leaves out.
+    """One point of a batch, with the sentence a batch leaves out.
 
     Parameters
     ----------
@@ -333,20 +332,6 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
     there = np.isfinite(batch.poles_rad_s[index])
     poles = batch.poles_rad_s[index][there]
     coefficients = batch.coefficient_covariance[index]
-    n = batch.structure.order
-    zeros = np.empty(0, complex)
-    if status is not PolesStatus.TOO_FEW_LINES and np.isfinite(model.numerator).all():
-        zeros = model.zeros_rad_s()
-    known = bool(np.isfinite(coefficients).all()) and poles.size > 0
-    residue = zero = None
-    if known:
-        with np.errstate(all="ignore"):
-            residue = real_covariance(model.residue_sensitivity(poles), coefficients)
-            m = model.numerator.size
-            zero = real_covariance(
-                model.zero_sensitivity(zeros), coefficients[n : n + m, n : n + m]
-            )
-
     real = batch.significant[index][there]
     left_out = [
         f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
@@ -355,8 +340,6 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
     ]
     notes = [*left_out, *notes]
     there[there] = real
-    poles = poles[real]
-    residue = residue[real] if residue is not None and real.any() else None
 
     def optional(array: FloatArray) -> FloatArray | None:
         values = array[index][there]
@@ -365,16 +348,14 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
     said = [_sentence(batch, index, status), *notes, str(batch.remark[index])]
     message = "; ".join(filter(None, said))
     return Poles(
-        poles_rad_s=poles,
+        poles_rad_s=poles[real],
         f0_hz=batch.f0_hz[index][there],
         damping_ratio=batch.damping_ratio[index][there],
         residues=batch.residues[index][there],
         covariance=optional(batch.covariance),
         total_covariance=optional(batch.total_covariance),
         pole_covariance=optional(batch.pole_covariance),
-        residue_covariance=residue,
-        zeros_rad_s=zeros,
-        zero_covariance=zero,
+        coefficient_covariance=coefficients if np.isfinite(coefficients).all() else None,
         structure=batch.structure,
         band_hz=batch.band_hz,
         lines=int(batch.lines[index]),

@@ -154,6 +154,18 @@ class RationalModel:
         by_beta = b_values * (map_1 / a1)[..., None]
         return np.concatenate([by_alpha, by_beta], axis=-1)
 
+    def residue_covariance(self, poles_rad_s: ComplexArray, coefficients: FloatArray) -> FloatArray:
+        """(..., k, 2, 2) of (Re, Im) of the residues at simple poles (..., k).
+
+        Of `coefficients` (..., p, p), the covariance of the free ones of A, then B.
+        """
+        return real_covariance(self.residue_sensitivity(poles_rad_s), coefficients)
+
+    def zero_covariance(self, zeros_rad_s: ComplexArray, coefficients: FloatArray) -> FloatArray:
+        """(..., k, 2, 2) of (Re, Im) of simple zeros (..., k); see `residue_covariance`."""
+        first = self.denominator.shape[-1] - 1
+        return real_covariance(self.zero_sensitivity(zeros_rad_s), coefficients[..., first:, first:])
+
 
 @entry
 def _residues_and_sensitivity(x, ds_dx, denominator, numerator, hessenberg_a, hessenberg_b):
@@ -187,6 +199,25 @@ def _residues_and_sensitivity(x, ds_dx, denominator, numerator, hessenberg_a, he
             residues[point, k] = above * factor
     return residues, sensitivity
 
+
+def real_covariance(sensitivity: ComplexArray, parameters: FloatArray) -> FloatArray:
+    """(..., k, 2, 2) covariance of (Re, Im) of k quantities from that of the coefficients.
+
+    Parameters
+    ----------
+    sensitivity : (..., k, p) complex
+    parameters : (..., n, n) float
+        Of which the first p belong to the sensitivity.
+    """
+    p = sensitivity.shape[-1]
+    stacked = real_rows(sensitivity)
+    return stacked @ parameters[..., None, :p, :p] @ stacked.swapaxes(-1, -2)
+
+
+def real_rows(values: ComplexArray) -> FloatArray:
+    """(..., 2, p) real and imaginary parts of (..., p)."""
+    parts = np.ascontiguousarray(values).view(float).reshape(*values.shape, 2)
+    return np.ascontiguousarray(parts.swapaxes(-1, -2))
 
 
 def _dot(basis: ComplexArray, coefficients: FloatArray) -> ComplexArray:

@@ -12,7 +12,7 @@ from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.compiled import entry
-from tactile_resonance.poles.model import RationalModel
+from tactile_resonance.poles.model import RationalModel, real_covariance
 from tactile_resonance.poles.result import natural_frequency_and_damping
 
 # A mode this fraction of the band outside of it is still one that the lines show.
@@ -78,26 +78,6 @@ def two_roots(coefficients, h):
             roots[point, 0] = large
             roots[point, 1] = 0.0 if large == 0 else (first * second - beside * h[1, 0]) / large
     return roots
-
-
-def real_covariance(sensitivity: ComplexArray, parameters: FloatArray) -> FloatArray:
-    """(..., k, 2, 2) covariance of (Re, Im) of k quantities from that of the coefficients.
-
-    Parameters
-    ----------
-    sensitivity : (..., k, p) complex
-    parameters : (..., n, n) float
-        Of which the first p belong to the sensitivity.
-    """
-    p = sensitivity.shape[-1]
-    stacked = real_rows(sensitivity)
-    return stacked @ parameters[..., None, :p, :p] @ stacked.swapaxes(-1, -2)
-
-
-def real_rows(values: ComplexArray) -> FloatArray:
-    """(..., 2, p) real and imaginary parts of (..., p)."""
-    parts = np.ascontiguousarray(values).view(float).reshape(*values.shape, 2)
-    return np.ascontiguousarray(parts.swapaxes(-1, -2))
 
 
 def propagated(

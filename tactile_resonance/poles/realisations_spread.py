@@ -18,8 +18,8 @@ from scipy import special
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.likelihood import invert, moments
+from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
-from tactile_resonance.poles.modes import real_rows
 from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
 
 if TYPE_CHECKING:

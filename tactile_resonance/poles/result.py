@@ -96,12 +96,8 @@ class Poles:
         From noise, distortion and model error, where they can be estimated.
     pole_covariance : (n, 2, 2) float or None
         Of (Re, Im) of each pole [rad^2/s^2], from noise.
-    residue_covariance : (n, 2, 2) float or None
-        Of (Re, Im) of each residue [rad^2/s^2], from noise.
-    zeros_rad_s : (k,) complex
-        All zeros of the model [rad/s]; those far outside the band mean nothing.
-    zero_covariance : (k, 2, 2) float or None
-        Of (Re, Im) of each zero, from noise.
+    coefficient_covariance : (p, p) float or None
+        Of the free coefficients of ``fit``, as in `PolesBatch`.
     f0_drift_hz_per_s, damping_drift_per_s : (n,) float or None
         What f0 and damping ratio change by over a record, of which poles are then the means: the slope
         of the straight line nearest to the change. None where nothing shows that they do.
@@ -141,9 +137,7 @@ class Poles:
     covariance: FloatArray | None = None
     total_covariance: FloatArray | None = None
     pole_covariance: FloatArray | None = None
-    residue_covariance: FloatArray | None = None
-    zeros_rad_s: ComplexArray = field(default_factory=lambda: np.empty(0, complex))
-    zero_covariance: FloatArray | None = None
+    coefficient_covariance: FloatArray | None = None
     f0_drift_hz_per_s: FloatArray | None = None
     damping_drift_per_s: FloatArray | None = None
     drift_covariance: FloatArray | None = None
@@ -166,6 +160,27 @@ class Poles:
     def bands(self) -> tuple[Poles, ...]:
         """Of each band, the first being these."""
         return (self, *self.further)
+
+    @property
+    def residue_covariance(self) -> FloatArray | None:
+        """(n, 2, 2) of (Re, Im) of each residue [rad^2/s^2], from noise; None where unknown."""
+        if self.fit is None or self.coefficient_covariance is None or not self.f0_hz.size:
+            return None
+        return self.fit.residue_covariance(self.poles_rad_s, self.coefficient_covariance)
+
+    @property
+    def zeros_rad_s(self) -> ComplexArray:
+        """(k,) all zeros of the model [rad/s]; those far outside the band mean nothing."""
+        if self.fit is None or not np.isfinite(self.fit.numerator).all():
+            return np.empty(0, complex)
+        return self.fit.zeros_rad_s()
+
+    @property
+    def zero_covariance(self) -> FloatArray | None:
+        """(k, 2, 2) of (Re, Im) of each zero [rad^2/s^2], from noise; None where unknown."""
+        if self.fit is None or self.coefficient_covariance is None:
+            return None
+        return self.fit.zero_covariance(self.zeros_rad_s, self.coefficient_covariance)
 
     def noting(self, *notes: str) -> Poles:
         """Return these poles with notes added to the message; empty notes are left out."""

@@ -16,7 +16,7 @@ from scipy import special
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
-from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.outliers import (
     FALSE_ALARM,
@@ -235,6 +235,16 @@ def _lines_in_a_row(plan: JointPlan) -> bool:
     return bool(np.any(np.diff(gone) == 1))
 
 
+@lru_cache(maxsize=16)
+def _kinds(plan: JointPlan) -> list[BoolArray]:
+    """(K,) each, as `chances_of` takes them: excited lines, other even and odd harmonics, bins between."""
+    on_line, odd = plan.bins % plan.periods == 0, plan.bins // plan.periods % 2 == 1
+    excited, others = np.zeros((2, odd.size), bool)
+    excited[plan.excited_at] = others[plan.others_at] = True
+    silent = others & on_line
+    return [excited, silent & ~odd, silent & odd, others & ~on_line]
+
+
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
     """Bin and channel of what stands out most, if noise would not make it."""
@@ -244,15 +254,12 @@ def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
     rounding_y, rounding_u = (
         ROUNDING * np.mean(np.abs(x[:, plan.driven]) ** 2) for x in (fitted.y, fitted.u)
     )
-    on_line, odd = plan.bins % plan.periods == 0, plan.bins // plan.periods % 2 == 1
-    excited, others = (np.isin(np.arange(odd.size), at) for at in (plan.excited_at, plan.others_at))
-    silent = others & on_line
-    kinds = [excited, silent & ~odd, silent & odd, others & ~on_line]
+    kinds = _kinds(plan)
     input_power = np.mean(np.abs(fitted.u) ** 2, axis=0)
     falls, least = fitted.without_each(), rounding_y / fitted.variance
     if not plan.level_known:  # noise of the input may make more at a resonance
         least = np.maximum(least, 1.4 * median_filter(falls, 5))
-    other = [np.zeros_like(on_line), *kinds[1:]]
+    other = [np.zeros_like(kinds[0]), *kinds[1:]]
     chances = {
         "sensor": chances_of(falls, kinds, len(fitted.y), least),
         "actuator": chances_of(input_power, other, len(fitted.u), rounding_u),

@@ -6,14 +6,14 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.signal
+from poles.mode_at_250_hz import BARE, LINES_HZ, W0, G, circular, frf
+from scipy import stats
 
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.structure import ModelStructure
-
-LINES_HZ = np.linspace(200, 300, 41)
 
 
 @pytest.fixture(params=["s", "z"])
@@ -139,3 +139,34 @@ def test_joint_estimator_without_periodicity():
     result = plan(np.broadcast_to(u, noise.shape), y + noise)
     deviation = (result.f0_hz[:, 0] - 250) / np.sqrt(result.covariance[:, 0, 0, 0])
     assert 62 < np.sum(deviation**2) < 149  # 99.8 % of chi-square with 100 degrees of freedom
+
+
+def test_residues_and_zeros_scatter_as_their_covariances_say():
+    """``.1 + .04 w^2 / (s^2 + .04 w s + w^2)``, noise of known variance; residue and zeros in closed form."""
+    rng, runs = np.random.default_rng(5), 300
+    pole = W0 * complex(-0.02, np.sqrt(1 - 0.02**2))
+    residue = 0.04 * W0**2 / (pole - pole.conjugate())
+    zero = np.roots([0.1, 0.1 * 0.04 * W0, 0.14 * W0**2])[0]
+    zero = complex(zero.real, abs(zero.imag))
+    distances = []
+    for _ in range(runs):
+        poles = identify_frf(frf(g=G + circular(rng, (41,), 1e-6), noise_dof=1000), structure=BARE)
+        k = np.argmax(poles.zeros_rad_s.imag)
+        pairs = (
+            (poles.residues[0] - residue, poles.residue_covariance[0]),
+            (poles.zeros_rad_s[k] - zero, poles.zero_covariance[k]),
+        )
+        errors = [(np.array([e.real, e.imag]), covariance) for e, covariance in pairs]
+        distances.append([e @ np.linalg.solve(c, e) for e, c in errors])
+    total = np.sum(distances, axis=0)
+    assert np.all(stats.chi2.ppf(5e-4, 2 * runs) < total)
+    assert np.all(total < stats.chi2.ppf(1 - 5e-4, 2 * runs))
+
+
+def test_without_a_covariance_of_coefficients_there_is_none_of_residues_and_zeros():
+    poles = identify_frf(frf(), structure=BARE)
+    assert (poles.residues.size, poles.zeros_rad_s.size) == (1, 2)
+    without = dataclasses.replace(poles, coefficient_covariance=None)
+    assert without.residue_covariance is None
+    assert without.zero_covariance is None
+    assert dataclasses.replace(poles, fit=None).zeros_rad_s.size == 0
