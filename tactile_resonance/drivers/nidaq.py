@@ -186,16 +186,16 @@ class NiDaqDevice:
         n = excitation.samples_per_period
         raw = np.zeros((len(self._scales), n), self._raw_dtype)  # (channels, N)
         try:
-            with translated(f"block {self._index}"):
+            with translated(f"block {self._index + 1}"):
                 reader = self._readers.AnalogUnscaledReader(task.in_stream)
                 read = reader.read_int16 if self._raw_dtype is np.int16 else reader.read_int32
                 count = read(raw, number_of_samples_per_channel=n, timeout=timeout_s)
                 # an output that ran dry is silent on the input's side: this call raises its error
                 ended = output.is_task_done()
             if count != n:
-                raise DeviceError(f"nidaqmx: block {self._index}: {count} of {n} samples")
+                raise DeviceError(f"nidaqmx: block {self._index + 1}: {count} of {n} samples")
             if ended:
-                raise DeviceError(f"nidaqmx: block {self._index}: the output has stopped")
+                raise DeviceError(f"nidaqmx: block {self._index + 1}: the output has stopped")
         except DeviceError as error:
             raise self._stopped_after(error) from error
         channels = [scale.channel(row) for scale, row in zip(self._scales, raw, strict=True)]

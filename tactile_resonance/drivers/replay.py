@@ -102,7 +102,7 @@ class ReplayDevice:
             if realisation not in recorded:
                 raise DeviceError(
                     f"replay: measurement {self._measurement.measurement_id}: the excitation of "
-                    f"realisation {realisation} is not readable {list(self._measurement.problems)}"
+                    f"realisation {realisation + 1} is not readable {list(self._measurement.problems)}"
                 )
             excitation = recorded[realisation]
             is_last = realisation == last.realisation
@@ -175,7 +175,7 @@ class ReplayDevice:
             if wait_s > timeout_s:
                 raise DeviceError(f"replay: no block within {timeout_s:g} s")
         record = self._blocks.get(index)
-        where = f"block {index} of realisation {excitation.realisation}"
+        where = f"block {index + 1} of realisation {excitation.realisation + 1}"
         if record is None:
             raise DeviceError(f"replay: {where} is missing in {self._path}")
         n = excitation.samples_per_period

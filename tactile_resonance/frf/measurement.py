@@ -114,7 +114,7 @@ class MeasurementFrf:
         so_far = self._periods.setdefault(record.realisation, 0)
         if record.block_index * (u.size // n) != so_far:
             self._note(
-                f"realisation {record.realisation}: blocks lost before block {record.block_index}, "
+                f"realisation {record.realisation + 1}: blocks lost before block {record.block_index + 1}, "
                 "not used from there on"
             )
         else:
@@ -193,7 +193,7 @@ class MeasurementFrf:
         periods = so_far + record.periods
         if periods > self._samples.shape[1]:
             raise ValueError(
-                f"record: {periods} periods of realisation {realisation}, at most "
+                f"record: {periods} periods of realisation {realisation + 1}, at most "
                 f"{self._samples.shape[1]} are accepted, those of the excitation"
             )
         self._samples[:, so_far:periods] = record.samples
@@ -220,7 +220,7 @@ class MeasurementFrf:
         if periods < max(self._periods.values()):
             return  # it counts once it is as long as the others
         for number in self._spectra.keys() - self._whole:
-            self._note(f"realisation {number}: left out, shorter than the others")
+            self._note(f"realisation {number + 1}: left out, shorter than the others")
         each, bins_of_each = zip(*(self._spectra[number] for number in self._whole), strict=True)
         frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
         stacked = [stacked_bins(of) for of in zip(*bins_of_each, strict=True)]

@@ -263,7 +263,7 @@ class BenchDevice:
             if self._armed and message.excitation_id == self._armed.excitation_id:
                 break
         if message.block_index != self._next_index:
-            raise DeviceError(f"device: block {self._next_index} lost, got {message.block_index}")
+            raise DeviceError(f"device: block {self._next_index + 1} lost, got {message.block_index + 1}")
         self._next_index += 1
         record = record_from_message(message)
         return AcquiredBlock(

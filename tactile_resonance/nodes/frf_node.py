@@ -99,7 +99,7 @@ class FrfNode(ManagedNode):
             if len(self._waiting) > MOST_WAITING:
                 lost = self._waiting.pop(0)
                 self.health.error(
-                    f"no excitation {lost.origin.excitation_id} arrived: block {lost.block_index} not used"
+                    f"no excitation {lost.origin.excitation_id} arrived: block {lost.block_index + 1} not used"
                 )
             return
         measurement = self._measurement

@@ -300,8 +300,8 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
             [first.samples_per_period, *first.harmonics],
         ):
             raise ValueError(
-                f"measurement {key}: realisation {excitation.realisation} differs from realisation "
-                f"{first.realisation} in sample rate, period or lines, expected the same"
+                f"measurement {key}: realisation {excitation.realisation + 1} differs from realisation "
+                f"{first.realisation + 1} in sample rate, period or lines, expected the same"
             )
         blocks = _leading_blocks(measurement, excitation.realisation)
         n = excitation.samples_per_period
@@ -319,7 +319,7 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
     for excitation, u, _ in played:
         if len(u) < wanted:
             notes.append(
-                f"realisation {excitation.realisation} left out: {len(u)} of {wanted} consecutive "
+                f"realisation {excitation.realisation + 1} left out: {len(u)} of {wanted} consecutive "
                 "periods are there"
             )
     channels = [(u[:wanted], y[:wanted]) for _, u, y in played if len(u) >= wanted]

@@ -150,7 +150,7 @@ def test_overrun_is_named_and_the_output_zeroed(hardware):
     device.play()
     device.read_block(1.0)
     hardware.samples_late = 500_001
-    with pytest.raises(DeviceError, match="nidaqmx: block 1: overrun, blocks are lost"):
+    with pytest.raises(DeviceError, match="nidaqmx: block 2: overrun, blocks are lost"):
         device.read_block(1.0)
     assert hardware.pin_v == 0.0
     assert hardware.open_tasks == []
@@ -161,7 +161,7 @@ def test_an_output_that_ran_dry_is_named(hardware):
     device.play()
     hardware.output_dies_at = 700
     device.read_block(1.0)
-    with pytest.raises(DeviceError, match="block 1: DAC conversion attempted") as raised:
+    with pytest.raises(DeviceError, match="block 2: DAC conversion attempted") as raised:
         device.read_block(1.0)
     assert "\n" not in str(raised.value)
     assert hardware.pin_v == 0.0

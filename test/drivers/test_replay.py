@@ -139,10 +139,10 @@ def test_a_gap_is_an_error_where_it_comes(tmp_path):
     device.arm(first)
     device.play()
     assert [device.read_block(1.0).index for _ in range(2)] == [0, 1]
-    with pytest.raises(DeviceError, match="block 2 of realisation 0 is missing"):
+    with pytest.raises(DeviceError, match="block 3 of realisation 1 is missing"):
         device.read_block(1.0)
     (folder / "excitation-00000.npz").write_bytes(b"rubbish")
-    with pytest.raises(DeviceError, match="excitation of realisation 0 is not readable"):
+    with pytest.raises(DeviceError, match="excitation of realisation 1 is not readable"):
         ReplayDevice(tmp_path).plan(ASKED)
 
 

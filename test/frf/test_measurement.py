@@ -107,8 +107,8 @@ def test_a_realisation_that_lost_blocks_does_not_shorten_the_others():
     assert_equal(replace(frf, status=FrfStatus.OK), expected)
     assert (frf.realisations, frf.periods, frf.status) == (2, 4, FrfStatus.SUSPECT)
     assert frf.bins.u.shape[0] == 2
-    assert "realisation 0: blocks lost" in frf.message
-    assert "realisation 0: left out, shorter than the others" in frf.message
+    assert "realisation 1: blocks lost" in frf.message
+    assert "realisation 1: left out, shorter than the others" in frf.message
 
 
 def test_a_realisation_that_was_lost_is_no_failure(channels):
@@ -139,7 +139,7 @@ def test_what_is_too_much_is_refused(channels):
     measurement = MeasurementFrf(1)
     for p in range(4):
         measurement.add(record(u[0, p], y[0, p], 0, p), excitation(0))
-    with pytest.raises(ValueError, match="record: 5 periods of realisation 0, at most 4"):
+    with pytest.raises(ValueError, match="record: 5 periods of realisation 1, at most 4"):
         measurement.add(record(u[0, 0], y[0, 0], 0, 4), excitation(0))
     with pytest.raises(ValueError, match=r"band_hz: 300\.\.400 holds no excited line"):
         MeasurementFrf(1, band_hz=(300.0, 400.0)).add(record(u[0, 0], y[0, 0], 0, 0), excitation(0))
@@ -177,7 +177,7 @@ def test_a_lost_block_is_said_and_what_follows_left_out(channels):
         measurement.add(record(u[0, p], y[0, p], 0, p), excitation(0))
     frf = measurement.frf()
     assert frf.status is FrfStatus.SUSPECT
-    assert "blocks lost before block 3" in frf.message
+    assert "blocks lost before block 4" in frf.message
     assert frf.periods == 2
 
 

@@ -162,7 +162,7 @@ def test_recording_holds_the_complete_realisations(tmp_path):
     (folder / "record-00001-0000002.npz").unlink()
     part = read_store_recording(tmp_path)
     np.testing.assert_array_equal(part.y, whole.y[[0, 2]])
-    assert part.notes == ("realisation 1 left out: 2 of 4 consecutive periods are there",)
+    assert part.notes == ("realisation 2 left out: 2 of 4 consecutive periods are there",)
     # the periods before the gap serve where so many are enough
     short = read_store_recording(tmp_path, periods=2)
     np.testing.assert_array_equal(short.y, whole.y[:, :2])
