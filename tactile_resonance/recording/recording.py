@@ -163,6 +163,9 @@ def make_recording(
     return Recording(channels[0], channels[1], rate_hz, _harmonics(excited_harmonics, n))
 
 
+LARGEST_BETWEEN_V = 1e-70, 1e70
+"""Of a channel: fourth powers of voltages must neither overflow nor vanish."""
+
 # Part of the actuator's power that differs from period to period, from which another period is looked for, and
 # how much less must differ after that.
 DIFFERS, BETTER = 1e-4, 10.0
@@ -268,10 +271,13 @@ def _period_length(
 
 
 def _check_samples(samples: npt.NDArray[np.floating], name: str) -> None:
-    """Every sample finite."""
+    """Every sample finite, also its powers."""
     bad = samples.size - int(np.count_nonzero(np.isfinite(samples)))
     if bad:
         raise ValueError(f"{name}: {bad} samples are NaN or infinite, expected finite voltages")
+    largest, (low, high) = float(max(samples.max(), -samples.min())), LARGEST_BETWEEN_V
+    if not (largest == 0 or low <= largest <= high):
+        raise ValueError(f"{name}: up to {largest:g} V, expected 0 or {low:g} to {high:g} V")
 
 
 def _harmonics(values: npt.ArrayLike | None, n: int) -> IntArray | None:

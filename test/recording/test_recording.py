@@ -65,6 +65,8 @@ def test_single_precision_is_not_copied():
         ({"y": Y[:-1]}, r"y: shape \(23,\), expected that of u"),
         ({"y": np.where(np.arange(24) == 3, np.nan, Y)}, "y: 1 samples are NaN or infinite"),
         ({"u": np.where(np.arange(24) == 3, np.inf, U)}, "u: 1 samples are NaN or infinite"),
+        ({"y": 1e90 * Y}, r"y: up to .*e\+\d+ V, expected 0 or 1e-70 to 1e\+70 V"),
+        ({"u": 1e-90 * U}, r"u: up to .*e-\d+ V, expected 0 or 1e-70 to 1e\+70 V"),
         ({"y": np.ma.masked_greater(Y, 0.5)}, "y: .* samples are NaN or infinite"),
         ({"u": np.array(["a"] * 24)}, "u: values of type"),
         ({"u": U * 1j}, "u: values of type complex"),
