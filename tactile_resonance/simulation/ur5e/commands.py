@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands of the RTDE client: those that move the arm, and those that set or ask something."""
+"""Commands of the RTDE client: those that move the arm, those that set something, and those that ask."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
 
 from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
 from tactile_resonance.simulation.ur5e import motion
 from tactile_resonance.simulation.ur5e.forces import ForceTask, ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
 from tactile_resonance.simulation.ur5e.machine import ExternalSensor, Machine
-from tactile_resonance.simulation.ur5e.poses import (
-    ZERO,
-    Six,
-    Transform,
-    pose_from_transform,
-    product,
-    transform_from_pose,
-)
+from tactile_resonance.simulation.ur5e.poses import ZERO, Six, pose_from_transform, product
 from tactile_resonance.simulation.ur5e.registers import Script, Thread
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError, Target
 
@@ -29,10 +24,12 @@ CONTACT_FOUND = 254
 CONTACT_STOP = 3.0
 # Defaults of URScript's movel: acceleration [m/s^2] and speed [m/s].
 MOVE_ACCELERATION, MOVE_SPEED = 1.2, 0.25
+# Deceleration [m/s^2] of the stop that ends force mode.
+FORCE_MODE_STOP = 10.0
 
 
-class MotionCommands:
-    """Handlers of the commands that move the arm; a generator where moving takes time."""
+class Handlers:
+    """What commands do that move the arm or set something; a generator where that takes time."""
 
     def __init__(self, script: Script, machine: Machine) -> None:
         self._script = script
@@ -45,36 +42,15 @@ class MotionCommands:
         self._jog_twist = ZERO
         self._contact_steps = 0
 
-    def movej(self) -> Thread:
-        """Move to joint angles, asynchronously where integer 1 says so."""
-        return self._movej(self._script.doubles(0))
-
-    def movej_pose(self) -> Thread:
-        """Move the joints to where the TCP has a pose."""
-        return self._movej(self._machine.solved(transform_from_pose(self._script.doubles(0))))
-
-    def movel(self) -> Thread:
-        """Move straight to a pose."""
-        return self._movel(transform_from_pose(self._script.doubles(0)))
-
-    def movel_joints(self) -> Thread:
-        """Move straight to the pose of joint angles."""
-        return self._movel(Posture(self._script.doubles(0)).tool(self._target.tcp))
-
-    def _movej(self, goal: Six) -> Thread:
-        speed, acceleration = self._script.double(6), self._script.double(7)
-        return self._move(motion.movej(self._target, goal, acceleration, speed))
-
-    def _movel(self, goal: Transform) -> Thread:
-        speed, acceleration = self._script.double(6), self._script.double(7)
-        return self._move(motion.movel(self._target, goal, acceleration, speed))
-
-    def _move(self, move: Thread) -> Thread:
+    def move(self, run: Callable[[Target, Any, float, float], Thread], goal: Any) -> Thread:
+        """Move to joint angles or a pose, asynchronously where integer 1 says so."""
+        script = self._script
+        work = run(self._target, goal, script.double(7), script.double(6))
         self._stop_asynchronous_move()
-        if self._script.integer(1) == 1:
-            self._script.run("move", self._told(move))
+        if script.integer(1) == 1:
+            script.run("move", self._told(work))
         else:
-            yield from move
+            yield from work
 
     def _told(self, work: Thread) -> Thread:
         """Run a motion as an asynchronous operation, and report its begin and end to the client."""
@@ -103,15 +79,8 @@ class MotionCommands:
         else:
             yield from work
 
-    def speedl(self) -> None:
-        """Move the TCP with a twist until the next command."""
-        self._speed_to(motion.speedl)
-
-    def speedj(self) -> None:
-        """Move the joints with speeds until the next command."""
-        self._speed_to(motion.speedj)
-
-    def _speed_to(self, run: SpeedMotion) -> None:
+    def speed(self, run: SpeedMotion) -> None:
+        """Move the TCP with a twist, or the joints with speeds, until the next command."""
         script = self._script
         self._speed = (run, script.doubles(0), script.double(6), script.double(7))
         if "speed" not in script.threads:
@@ -129,15 +98,8 @@ class MotionCommands:
         stop = motion.stopl if self._speed[0] is motion.speedl else motion.stopj
         return stop(self._target, self._script.double(0))
 
-    def servoj(self) -> None:
+    def servo(self, goal: Six) -> None:
         """Follow joint angles."""
-        self._servo_to(self._script.doubles(0))
-
-    def servol(self) -> None:
-        """Follow poses, each taken as the joint angles nearest to the actual ones."""
-        self._servo_to(self._machine.solved(transform_from_pose(self._script.doubles(0))))
-
-    def _servo_to(self, goal: Six) -> None:
         script = self._script
         gain = script.double(10)
         if not 100 <= gain <= 2000:
@@ -208,7 +170,7 @@ class MotionCommands:
     def start_jog(self) -> None:
         """Move with a twist in the base, the tool or another frame."""
         script = self._script
-        axes = [NO_TURN, self._machine.tcp[0], transform_from_pose(script.doubles(8))[0]]
+        axes = [NO_TURN, self._machine.tcp[0], script.pose(8)[0]]
         feature = round(script.double(6))
         if feature not in (0, 1, 2):
             raise ScriptError(f"jog: feature {feature}; accepted are 0 base, 1 tool, 2 custom")
@@ -226,25 +188,12 @@ class MotionCommands:
         self._script.kill("jog")
         return motion.stopl(self._target, 1.2)
 
-
-# Deceleration [m/s^2] of the stop that ends force mode.
-FORCE_MODE_STOP = 10.0
-
-
-class SettingCommands:
-    """Handlers of the commands that set something or answer."""
-
-    def __init__(self, script: Script, machine: Machine) -> None:
-        self._script = script
-        self._machine = machine
-        self._target = machine.target
-
     def force_mode(self) -> None:
         """Give way along chosen axes until pressing with a wrench."""
         script = self._script
         selection = tuple([script.integer(2 + axis) == 1 for axis in range(6)])
         task = ForceTask(
-            self._pose(), selection, script.doubles(6), script.integer(1), script.doubles(12)
+            script.pose(), selection, script.doubles(6), script.integer(1), script.doubles(12)
         )
         self._machine.force_mode.begin(task)
 
@@ -253,29 +202,15 @@ class SettingCommands:
         self._machine.force_mode.end()
         return motion.stopl(self._target, FORCE_MODE_STOP)
 
-    def set_damping(self) -> None:
-        """Set the damping of force mode."""
-        damping = self._script.double(0)
-        if not 0.0 <= damping <= 1.0:
-            raise ScriptError(f"force_mode_set_damping: {damping:g}; accepted is 0 to 1")
-        self._machine.force_mode.damping = damping
+    def set_force_mode(self, name: str, most: float) -> None:
+        """Set a figure of force mode."""
+        value = self._script.double(0)
+        if not 0.0 <= value <= most:
+            raise ScriptError(f"force_mode_set_{name}: {value:g}; accepted is 0 to {most:g}")
+        setattr(self._machine.force_mode, name, value)
 
-    def set_gain(self) -> None:
-        """Set the gain scaling of force mode."""
-        scaling = self._script.double(0)
-        if not 0.0 <= scaling <= 2.0:
-            raise ScriptError(f"force_mode_set_gain_scaling: {scaling:g}; accepted is 0 to 2")
-        self._machine.force_mode.gain_scaling = scaling
-
-    def set_payload(self) -> None:
+    def set_payload(self, inertia: Six) -> None:
         """Set mass and centre of gravity of what the flange carries."""
-        self._set_payload(self._machine.payload.inertia_kg_m2)
-
-    def set_target_payload(self) -> None:
-        """Set the payload with its inertia."""
-        self._set_payload(self._script.doubles(4))
-
-    def _set_payload(self, inertia: Six) -> None:
         mass, cog = self._script.double(0), self._script.vector(1)
         if not mass >= 0.0:
             raise ScriptError(f"set_payload: mass {mass:g}; accepted is 0 kg or above")
@@ -285,82 +220,13 @@ class SettingCommands:
 
     def set_tcp(self) -> None:
         """Set the TCP in the flange."""
-        self._target.tcp = self._pose()
+        self._target.tcp = self._script.pose()
 
     def set_gravity(self) -> None:
         """Set the direction of gravity."""
         # the script's vector points against the fall: (0, 0, 9.82) for an arm on the floor
         x, y, z = self._script.vector(0)
         self._machine.gravity_m_s2 = (-x, -y, -z)
-
-    def tool_contact(self) -> None:
-        """How many cycles ago a contact began, 0 without contact."""
-        self._script.answer(self._machine.contact_steps(self._script.vector(0)))
-
-    def step_time(self) -> None:
-        """The control period."""
-        self._script.answer_doubles([CYCLE_S])
-
-    def past_joints(self) -> None:
-        """Joint angles of some cycles ago."""
-        steps = self._script.integer(1)
-        self._script.answer_doubles(self._machine.past_joints(steps))
-
-    def joint_torques(self) -> None:
-        """Torques of the joints against outer forces."""
-        # those of outer forces alone: weight and friction of the arm are taken off
-        self._script.answer_doubles(self._machine.outer_torque)
-
-    def flange_pose(self) -> None:
-        """Actual pose of the flange."""
-        self._script.answer_doubles(pose_from_transform(self._machine.posture.flange))
-
-    def tcp_offset(self) -> None:
-        """Pose of the TCP in the flange."""
-        self._script.answer_doubles(pose_from_transform(self._target.tcp))
-
-    def pose_trans(self) -> None:
-        """Product of two poses."""
-        second = transform_from_pose(self._script.doubles(6))
-        self._script.answer_doubles(pose_from_transform(product(self._pose(), second)))
-
-    def actual_forward(self) -> None:
-        """Actual pose of the TCP."""
-        self._script.answer_doubles(self._machine.tcp_pose)
-
-    def forward(self) -> None:
-        """Pose of a TCP at joint angles."""
-        script = self._script
-        tool = Posture(script.doubles(0)).tool(transform_from_pose(script.doubles(6)))
-        script.answer_doubles(pose_from_transform(tool))
-
-    def inverse(self) -> None:
-        """Joint angles for a pose, nearest to the actual ones."""
-        self._script.answer_doubles(self._machine.solved(self._pose()))
-
-    def inverse_near(self) -> None:
-        """Joint angles for a pose, nearest to given ones; exact, whatever error is allowed."""
-        self._script.answer_doubles(self._machine.solved(self._pose(), self._script.doubles(6)))
-
-    def has_inverse(self) -> None:
-        """Whether a pose can be reached."""
-        self._script.answer(int(self._machine.solve(self._pose()) is not None))
-
-    def _pose(self) -> Transform:
-        return transform_from_pose(self._script.doubles(0))
-
-    def pose_within_limits(self) -> None:
-        """Whether a pose is reachable within the limits of the joints."""
-        q = self._machine.solve(self._pose())
-        self._script.answer(int(self._machine.within_limits(q)))
-
-    def joints_within_limits(self) -> None:
-        """Whether joint angles are within their limits."""
-        self._script.answer(int(self._machine.within_limits(self._script.doubles(0))))
-
-    def steady(self) -> None:
-        """Whether the arm has been at rest for half a second."""
-        self._script.answer(int(self._machine.steady))
 
     def protective_stop(self) -> None:
         """Ask for a protective stop."""
@@ -382,3 +248,69 @@ class SettingCommands:
             )
         else:
             self._machine.external = None
+
+
+def commands(script: Script, machine: Machine) -> dict[int, Callable[[], Thread | None]]:
+    """What the client's program does, by the number of the command."""
+    does, target = Handlers(script, machine), machine.target
+    pose, doubles = script.pose, script.doubles
+
+    def one(answer: Callable[[], int]) -> Callable[[], None]:
+        return lambda: script.answer(answer())
+
+    def many(answer: Callable[[], Iterable[float]]) -> Callable[[], None]:
+        return lambda: script.answer_doubles(answer())
+
+    return {
+        1: lambda: does.move(motion.movej, doubles(0)),
+        2: lambda: does.move(motion.movej, machine.solved(pose())),
+        3: lambda: does.move(motion.movel, pose()),
+        4: lambda: does.move(motion.movel, Posture(doubles(0)).tool(target.tcp)),
+        6: does.force_mode,
+        7: does.end_force_mode,
+        8: machine.sensor.zero,
+        9: partial(does.speed, motion.speedj),
+        10: partial(does.speed, motion.speedl),
+        11: lambda: does.servo(doubles(0)),
+        15: does.speed_stop,
+        16: does.servo_stop,
+        17: lambda: does.set_payload(machine.payload.inertia_kg_m2),
+        20: partial(does.set_force_mode, "damping", 1.0),
+        21: partial(does.set_force_mode, "gain_scaling", 2.0),
+        # each pose is taken as the joint angles nearest to the actual ones
+        24: lambda: does.servo(machine.solved(pose())),
+        25: one(lambda: machine.contact_steps(script.vector(0))),
+        26: many(lambda: [CYCLE_S]),
+        27: many(lambda: machine.past_joints(script.integer(1))),
+        29: does.set_tcp,
+        # exact, whatever error is allowed
+        30: many(lambda: machine.solved(pose(), doubles(6))),
+        31: does.protective_stop,
+        33: does.stop,
+        34: does.stop,
+        35: does.set_watchdog,
+        36: one(lambda: machine.within_limits(machine.solve(pose()))),
+        37: one(lambda: machine.within_limits(doubles(0))),
+        # those of outer forces alone: weight and friction of the arm are taken off
+        38: many(lambda: machine.outer_torque),
+        39: many(lambda: pose_from_transform(product(pose(), pose(6)))),
+        40: many(lambda: pose_from_transform(target.tcp)),
+        41: does.start_jog,
+        42: does.stop_jog,
+        43: many(lambda: machine.tcp_pose),
+        44: many(lambda: pose_from_transform(Posture(doubles(0)).tool(pose(6)))),
+        46: many(lambda: machine.solved(pose())),
+        47: one(lambda: machine.steady),
+        51: does.move_until_contact,
+        56: does.external_sensor,
+        57: does.external_sensor,
+        58: many(lambda: pose_from_transform(machine.posture.flange)),
+        59: does.set_gravity,
+        60: one(lambda: machine.solve(pose()) is not None),
+        61: one(lambda: machine.solve(pose()) is not None),
+        62: does.start_contact,
+        63: does.stop_contact,
+        64: does.read_contact,
+        65: lambda: does.set_payload(doubles(4)),
+        CONTACT_FOUND: does.back_to_contact,
+    }

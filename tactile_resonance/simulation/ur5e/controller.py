@@ -17,6 +17,7 @@ from tactile_resonance.simulation.ur5e.poses import largest
 from tactile_resonance.simulation.ur5e.program import Program, register_offset
 from tactile_resonance.simulation.ur5e.registers import (
     INPUT_TYPES,
+    INT_INPUTS,
     LARGEST_FIGURE,
     InputValue,
     Ports,
@@ -234,7 +235,7 @@ class UrController:
         """End the program where its client refreshes the command register too seldom."""
         program = self.program
         if program is not None and program.watchdog_s is not None:
-            if program.command_register in self.registers.refreshed:
+            if INT_INPUTS[program.offset] in self.registers.refreshed:
                 self._refreshed_s = self.time_s
             elif self.time_s - self._refreshed_s > program.watchdog_s + CYCLE_S / 2:
                 self._end_program("RTDE watchdog: the command register was not refreshed in time")

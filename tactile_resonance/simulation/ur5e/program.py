@@ -11,45 +11,14 @@ where the program was made for the upper range.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 
-from tactile_resonance.simulation.ur5e.commands import (
-    CONTACT_FOUND,
-    MotionCommands,
-    SettingCommands,
-)
+from tactile_resonance.simulation.ur5e.commands import commands
 from tactile_resonance.simulation.ur5e.machine import Machine
 from tactile_resonance.simulation.ur5e.registers import Registers, Script, Thread
 from tactile_resonance.simulation.ur5e.target import ScriptError
 
 # Commands that are done anew in every cycle in which they stand in the command register.
 STREAMING = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58})
-
-
-def _commands(script: Script, machine: Machine) -> dict[int, Callable[[], Thread | None]]:
-    """What the client's program does, by the number of the command."""
-    moves = MotionCommands(script, machine)
-    settings = SettingCommands(script, machine)
-    return {
-        1: moves.movej, 2: moves.movej_pose, 3: moves.movel, 4: moves.movel_joints,
-        6: settings.force_mode, 7: settings.end_force_mode, 8: machine.sensor.zero,
-        9: moves.speedj, 10: moves.speedl, 11: moves.servoj, 15: moves.speed_stop,
-        16: moves.servo_stop, 17: settings.set_payload, 20: settings.set_damping,
-        21: settings.set_gain, 24: moves.servol, 25: settings.tool_contact,
-        26: settings.step_time, 27: settings.past_joints, 29: settings.set_tcp,
-        30: settings.inverse_near, 31: settings.protective_stop, 33: moves.stop,
-        34: moves.stop, 35: settings.set_watchdog, 36: settings.pose_within_limits,
-        37: settings.joints_within_limits, 38: settings.joint_torques,
-        39: settings.pose_trans, 40: settings.tcp_offset, 41: moves.start_jog,
-        42: moves.stop_jog, 43: settings.actual_forward, 44: settings.forward,
-        46: settings.inverse, 47: settings.steady, 51: moves.move_until_contact,
-        56: settings.external_sensor, 57: settings.external_sensor,
-        58: settings.flange_pose, 59: settings.set_gravity, 60: settings.has_inverse,
-        61: settings.has_inverse, 62: moves.start_contact, 63: moves.stop_contact,
-        64: moves.read_contact, 65: settings.set_target_payload,
-        CONTACT_FOUND: moves.back_to_contact,
-    }  # fmt: skip
-
 
 READY, DONE = 1, 2
 STOP_SCRIPT = 255
@@ -77,7 +46,7 @@ def register_offset(text: str) -> int:
     return int(found[1])
 
 
-class Program:
+class Program(Script):
     """A running control program.
 
     Parameters
@@ -92,19 +61,9 @@ class Program:
     def __init__(self, machine: Machine, registers: Registers, offset: int) -> None:
         machine.force_mode.gain_scaling = _GAIN_SCALING
         machine.force_mode.damping = _DAMPING
-        self._script = Script(registers, offset)
-        self._commands = _commands(self._script, machine)
+        super().__init__(registers, offset)
+        self._commands = commands(self, machine)
         self._main = self._loop()
-
-    @property
-    def command_register(self) -> str:
-        """RTDE name of the register that carries the commands."""
-        return f"input_int_register_{self._script.offset}"
-
-    @property
-    def watchdog_s(self) -> float | None:
-        """Longest time without a refresh of the command register; None without a watchdog."""
-        return self._script.watchdog_s
 
     def step(self) -> bool:
         """Run one cycle, the main loop before the threads; False once the program has ended.
@@ -118,7 +77,7 @@ class Program:
             next(self._main)
         except StopIteration:
             return False
-        self._script.step_threads()
+        self.step_threads()
         return True
 
     def _loop(self) -> Thread:
@@ -127,25 +86,24 @@ class Program:
         A streaming command is done anew as long as it stands in the register; any other once, until
         the client has taken it away.
         """
-        script = self._script
-        script.end_asynchronous()
-        script.status(READY)
+        self.end_asynchronous()
+        self.status(READY)
         executing = False
         while True:
-            command = script.integer(0)
+            command = self.integer(0)
             if command == 0:
-                command, script.internal_command = script.internal_command, 0
+                command, self.internal_command = self.internal_command, 0
             if command in STREAMING:
                 yield from self._execute(command)
-                script.status(READY)
+                self.status(READY)
             elif command == 0:
                 executing = False
-                script.status(READY)
+                self.status(READY)
             elif not executing:
                 if command == STOP_SCRIPT:
                     return
                 yield from self._execute(command)
-                script.status(DONE)
+                self.status(DONE)
                 executing = True
             yield
 

@@ -8,6 +8,7 @@ from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.simulation.ur5e.poses import Transform, transform_from_pose
 from tactile_resonance.simulation.ur5e.target import ScriptError
 
 # Numbers 0 to 23 are the lower range, 24 to 47 the upper one.
@@ -182,6 +183,10 @@ class Script:
         """Return three double input registers; raises as `doubles`."""
         x, y, z = self.doubles(number, 3)
         return x, y, z
+
+    def pose(self, number: int = 0) -> Transform:
+        """Return the transform of a pose in six double input registers; raises as `doubles`."""
+        return transform_from_pose(self.doubles(number))
 
     def doubles(self, number: int, count: int = 6) -> tuple[float, ...]:
         """Return double input registers.
