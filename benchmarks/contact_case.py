@@ -20,10 +20,10 @@ from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, PlantSurface
-from tactile_resonance.simulation.plant.tip import Tip
+from tactile_resonance.simulation.plant.tip import Ball, Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.indenter import Ball, Indenter
+from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
 
 FORCE_N, RELAXATION, STANDOFF_M, TOOL_KG = 0.01, 0.6, 3e-3, 0.03

@@ -19,8 +19,8 @@ from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.simulation.plant.surfaces import RoundSurface, SurfaceMotion
-from tactile_resonance.simulation.plant.tip import Clinging, OnBone
-from tactile_resonance.simulation.tissue.indenter import Ball, Indenter
+from tactile_resonance.simulation.plant.tip import Ball, Clinging, OnBone
+from tactile_resonance.simulation.tissue.indenter import Indenter
 
 HOLD_S, SETTLED_S, SOFT_PA = 4.0, 0.5, 3e3
 """Held for so long; drawn back within 10 s and this; modulus of the layer on bone."""

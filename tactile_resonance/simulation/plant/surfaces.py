@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,19 +18,6 @@ if TYPE_CHECKING:
     from tactile_resonance.contact.samples import Pose
     from tactile_resonance.simulation.tissue.hertz import Tissue
     from tactile_resonance.simulation.tissue.scene import PhantomScene
-
-
-class PlantSurface(Protocol):
-    """The undisturbed surface of what lies on the table."""
-
-    @property
-    def curvature_per_m(self) -> float:
-        """Along any direction [1/m]; above 0 where it bulges out, below 0 where it is hollow."""
-        ...
-
-    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
-        """Height of a position above the surface [m], along the outward normal there."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -109,6 +96,10 @@ class RoundSurface:
         sign = -1.0 if self.hollow else 1.0
         normal = sign * x / away, sign * y / away, sign * z / away
         return sign * (away - self.radius_m), normal
+
+
+PlantSurface = FlatSurface | RoundSurface
+"""The undisturbed surface of what lies on the table."""
 
 
 def relative_radius_m(tip_radius_m: float, surface: PlantSurface) -> float:

@@ -8,7 +8,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil, sqrt
-from typing import Protocol
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from tactile_resonance.fields import require
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
 from tactile_resonance.simulation.sensor.bimorph import BeamModes
 from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.indenter import Ball, Beam, Indenter, Motion, swing
+from tactile_resonance.simulation.tissue.indenter import Beam, Indenter, Motion, swing
 
 UP_M = 1e-7
 """Over which the slope of a pull is taken [m]."""
@@ -25,8 +24,14 @@ UP_M = 1e-7
 class OnSoft(ABC):
     """A ball on soft tissue that something else acts on, too."""
 
-    def __init__(self, soft: Indenter) -> None:
+    def __init__(self, soft: Ball) -> None:
         self._soft = soft
+        self._beside_n = 0.0  # of what else acts
+
+    @property
+    def force_n(self) -> float:
+        """On the ball along the outward normal [N]."""
+        return self._soft.force_n + self._beside_n
 
     @property
     def depth_m(self) -> float:
@@ -38,16 +43,28 @@ class OnSoft(ABC):
         """On the soft tissue [m]."""
         return self._soft.contact_radius_m
 
-    @abstractmethod
     def step(self, depth_m: float, dt_s: float) -> float:
         """Move the ball to a depth within a time; return the force [N]."""
+        up_m_s = (self._soft.depth_m - depth_m) / dt_s
+        self._soft.step(depth_m, dt_s)
+        self._beside_n = self._act(up_m_s)
+        return self.force_n
 
-    @abstractmethod
     def tangent(self, dt_s: float) -> tuple[float, float]:
         """Force after holding for a time [N], and per further depth [N/m]."""
+        (force_n, slope), (beside_n, steeper) = self._soft.tangent(dt_s), self._ahead(dt_s)
+        return force_n + beside_n, slope + steeper
+
+    @abstractmethod
+    def _act(self, up_m_s: float) -> float:
+        """Force of what else acts [N], where the tissue has stepped and the ball went up at a speed."""
+
+    @abstractmethod
+    def _ahead(self, dt_s: float) -> tuple[float, float]:
+        """Its part of `tangent`."""
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
-        """See `Ball`."""
+        """See `Indenter.swing`."""
         base_m, rate_m_s = base
         for n in range(count):
             base_now_m = base_m + n * h_s * rate_m_s
@@ -55,6 +72,9 @@ class OnSoft(ABC):
             self.step(ball[0], h_s)
         return ball
 
+
+Ball = Indenter | OnSoft
+"""What presses on the tip."""
 
 BONE_PA, BONE_POISSON_RATIO = 10e6, 0.3
 
@@ -67,8 +87,8 @@ class OnBone(OnSoft):
 
     Parameters
     ----------
-    soft : Indenter
-        Ball on the layer.
+    soft : Ball
+        On the layer.
     layer_m : float
         Its thickness [m].
     radius_m : float
@@ -77,7 +97,7 @@ class OnBone(OnSoft):
 
     def __init__(
         self,
-        soft: Indenter,
+        soft: Ball,
         *,
         layer_m: float,
         radius_m: float,
@@ -87,23 +107,10 @@ class OnBone(OnSoft):
         self._layer_m = layer_m
         self._c = 4 / 3 * BONE_PA / (1 - BONE_POISSON_RATIO**2) * math.sqrt(radius_m)
 
-    @property
-    def force_n(self) -> float:
-        """On the ball along the outward normal [N]."""
-        return self._soft.force_n + self._bone()[0]
+    def _act(self, up_m_s: float) -> float:
+        return self._ahead(0.0)[0]
 
-    def step(self, depth_m: float, dt_s: float) -> float:
-        """Move the ball to a depth within a time; return the force [N]."""
-        self._soft.step(depth_m, dt_s)
-        return self.force_n
-
-    def tangent(self, dt_s: float) -> tuple[float, float]:
-        """Force after holding for a time [N], and per further depth [N/m]."""
-        force_n, slope = self._soft.tangent(dt_s)
-        pressed_n, steeper = self._bone()
-        return force_n + pressed_n, slope + steeper
-
-    def _bone(self) -> tuple[float, float]:
+    def _ahead(self, dt_s: float) -> tuple[float, float]:
         """Force of the bone and its slope (Hertz)."""
         root = math.sqrt(max(0.0, self._soft.depth_m - self._layer_m))
         return self._c * root**3, 1.5 * self._c * root
@@ -114,57 +121,35 @@ class Clinging(OnSoft):
 
     Parameters
     ----------
-    soft : Indenter
+    soft : Ball
     pull : callable
         Force [N] from the height of the ball above the surface [m] and its speed upwards [m/s]; None: it lets
         go until the tissue is touched again.
     """
 
-    def __init__(self, soft: Indenter, pull: Callable[[float, float], float | None]) -> None:
-        self.pull = pull
+    def __init__(self, soft: Ball, pull: Callable[[float, float], float | None]) -> None:
         super().__init__(soft)
-        self._touched, self._pulled_n = False, 0.0
+        self.pull = pull
+        self._touched = False
 
-    @property
-    def force_n(self) -> float:
-        """On the ball along the outward normal [N]."""
-        return self._soft.force_n - self._pulled_n
+    def _act(self, up_m_s: float) -> float:
+        self._touched |= self._soft.force_n > 0
+        if not self._touched or self._soft.depth_m >= 0:
+            return 0.0
+        pulled_n = self.pull(-self._soft.depth_m, up_m_s)
+        self._touched = pulled_n is not None
+        return -(pulled_n or 0.0)
 
-    def step(self, depth_m: float, dt_s: float) -> float:
-        """Move the ball to a depth within a time; return the force [N]."""
-        up_m_s = (self._soft.depth_m - depth_m) / dt_s
-        self._touched |= self._soft.step(depth_m, dt_s) > 0
-        self._pulled_n = 0.0
-        if self._touched and depth_m < 0:
-            pulled_n = self.pull(-depth_m, up_m_s)
-            self._touched, self._pulled_n = pulled_n is not None, pulled_n or 0.0
-        return self.force_n
-
-    def tangent(self, dt_s: float) -> tuple[float, float]:
-        """Force after holding for a time [N], and per further depth [N/m]."""
-        force_n, slope = self._soft.tangent(dt_s)
+    def _ahead(self, dt_s: float) -> tuple[float, float]:
         height_m = -self._soft.depth_m
         if not self._touched or height_m <= 0:
-            return force_n, slope
+            return 0.0, 0.0
         pulled_n = self.pull(height_m, 0.0) or 0.0
         further_n = self.pull(height_m + UP_M, UP_M / dt_s) or 0.0
-        return force_n - pulled_n, slope + max(0.0, further_n - pulled_n) / UP_M
+        return -pulled_n, max(0.0, further_n - pulled_n) / UP_M
 
 
 SUBSTEP_S = 5e-4  # a twentieth of the period of the mode on stiff gelatine
-
-
-class TipOnTissue(Protocol):
-    """A tip on one tissue through time: `RigidTip`, `SprungIndenter`."""
-
-    @property
-    def indenter(self) -> Ball:
-        """The ball."""
-        ...
-
-    def step(self, depth_m: float, dt_s: float, /) -> float:
-        """Advance with the depth of what holds the tip [m]; return the force on that [N]."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -173,7 +158,7 @@ class RigidTip:
 
     indenter: Ball
 
-    def step(self, depth_m: float, dt_s: float, /) -> float:
+    def step(self, depth_m: float, dt_s: float) -> float:
         """Advance with the depth of the ball [m]; return the force on it [N]."""
         return self.indenter.step(depth_m, dt_s)
 
@@ -249,6 +234,10 @@ class SprungIndenter:
         k, c, _ = self._beam
         self.force_n = k * (base_depth_m - depth) + c * (rate - speed)
         return self.force_n
+
+
+TipOnTissue = RigidTip | SprungIndenter
+"""A tip on one tissue through time: `step` takes the depth of what holds it, and returns the force on that."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ alone: whatever is compiled for it is in here).
 from __future__ import annotations
 
 from math import cos, exp, expm1, pi, pow, sin, sqrt
-from typing import Protocol
 
 import numpy as np
 from numba import float64, from_dtype, int64, njit
@@ -394,37 +393,6 @@ Motion = tuple[float, float]
 """Depth [m] and speed [m/s]: of the ball, or that the ball would have with the beam straight."""
 
 
-class Ball(Protocol):
-    """What presses on the tip: an `Indenter`, or one with something else to meet."""
-
-    @property
-    def force_n(self) -> float:
-        """On the tip along the outward normal [N]."""
-        ...
-
-    @property
-    def depth_m(self) -> float:
-        """Of the lowest point below the undisturbed surface [m]."""
-        ...
-
-    @property
-    def contact_radius_m(self) -> float:
-        """Of the contact on the tissue [m]."""
-        ...
-
-    def step(self, depth_m: float, dt_s: float) -> float:
-        """Move to a depth within a time; return the force [N]."""
-        ...
-
-    def tangent(self, dt_s: float) -> tuple[float, float]:
-        """Force after holding for a time [N], and per further depth [N/m]."""
-        ...
-
-    def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
-        """Move at the end of a beam for `count` times `h_s`, as the function `swing`; return its motion."""
-        ...
-
-
 class Indenter:
     """A spherical rigid tip on a viscoelastic half-space, stepped through time.
 
@@ -507,7 +475,7 @@ class Indenter:
         return _tangent(self._state, self._terms, dt_s)
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
-        """See `Ball`."""
+        """Move at the end of a beam for `count` times `h_s`, as the function `swing`; return its motion."""
         done = 0
         while done < count:
             depth_m, speed_m_s, self.force_n, self.contact_radius_m, now = _swing(
