@@ -14,7 +14,8 @@ from tactile_resonance.crest_factor import compress_crest_factor
 from tactile_resonance.drivers.acquisition import DeviceInfo
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.recording.messages import bands_from_message
+from tactile_resonance.poles.structure import PoleBand
+from tactile_resonance.recording.messages import each_from_message
 from tactile_resonance.sensor import MAX_LEVEL_V
 
 GRIDS = {
@@ -136,7 +137,7 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
             periods=goal.periods or periods,
             measurement_id=goal.measurement_id,
             label=goal.label,
-            bands=bands_from_message(goal),
+            bands=each_from_message(PoleBand, goal.bands),
         )
         for realisation in range(realisations)
     ]

@@ -24,11 +24,7 @@ from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.recording.messages import (
-    distortion_from_message,
-    time_from_message,
-    write_bands,
-)
+from tactile_resonance.recording.messages import each_from_message, time_from_message, write_each
 from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed, ScanEnded
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.point_file import offered_qos
@@ -98,7 +94,7 @@ class MeasureClient:
             seed=seed,
             sweep=design.sweep,
         )
-        write_bands(goal, msg.Band, design.bands)
+        write_each(goal.bands, msg.Band, design.bands)
         with self.recorder.recording(recording, goal.measurement_id):
             return self._follow(goal, enough, check, poll, held)
 
@@ -281,7 +277,7 @@ class ScanRecorder:
                 if topic == "poles":
                     self.poles.put(message)
                 elif topic == "frf":
-                    self.distortion = distortion_from_message(message)
+                    self.distortion = each_from_message(BandDistortion, message.distortion)
                 elif topic == "excitation":
                     self._described.add(message.excitation_id)
                 elif topic == "record":

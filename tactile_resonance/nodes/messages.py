@@ -23,23 +23,22 @@ from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.poles.result import Poles
+from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.messages import (
     SPREAD,
     array_of,
-    bands_from_message,
     complex_of,
-    distortion_from_message,
+    each_from_message,
     fill,
     fill_complex,
     key_of,
     optional,
     origin_from_message,
-    write_bands,
-    write_distortion,
+    write_each,
     write_excitation,
     write_origin,
     write_poles,
@@ -122,8 +121,8 @@ def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) ->
         values = getattr(frf, name)
         if values is not None:
             fill(getattr(message, name), values)
-    write_bands(message, msg.Band, frf.bands)
-    write_distortion(message, msg.Distortion, frf.distortion)
+    write_each(message.bands, msg.Band, frf.bands)
+    write_each(message.distortion, msg.Distortion, frf.distortion)
     if frf.bins is not None:
         _write_bins(message, (frf.bins, *frf.further_bins))
     return message
@@ -144,8 +143,8 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
         **{name: getattr(message, name) for name in FRF_EQUAL},
         bins=bins[0] if bins else None,
         further_bins=bins[1:],
-        bands=bands_from_message(message),
-        distortion=distortion_from_message(message),
+        bands=each_from_message(PoleBand, message.bands),
+        distortion=each_from_message(BandDistortion, message.distortion),
         status=key_of(FRF_STATUS, message.status, "status"),
     )
     return frf, origin_from_message(message)

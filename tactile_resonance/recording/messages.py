@@ -58,9 +58,9 @@ POLES = ("lines", "cost", "expected_cost", "condition_number", "method", "messag
 POLES_ARRAYS = ("f0_hz", "damping_ratio")
 POLES_DRIFTS = ("f0_drift_hz_per_s", "damping_drift_per_s")
 POLES_COVARIANCES = ("covariance", "total_covariance", "drift_covariance")
-EXCITATION, RECORD, BAND = _plain(Excitation), _plain(Record), _plain(PoleBand)
-DISTORTION, SPREAD = _plain(BandDistortion), _plain(ForceSpread)
+EXCITATION, RECORD, SPREAD = _plain(Excitation), _plain(Record), _plain(ForceSpread)
 E = TypeVar("E", bound=Enum)
+Plain = TypeVar("Plain", PoleBand, BandDistortion)
 
 
 def excitation_from_message(message: Any) -> Excitation:
@@ -74,18 +74,20 @@ def excitation_from_message(message: Any) -> Excitation:
     arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in EXCITATION_ARRAYS}
     arrays["harmonics"] = arrays["harmonics"].astype(np.int64)
     grid = key_of(GRIDS, message.grid, "grid")
-    bands = bands_from_message(message)
+    bands = each_from_message(PoleBand, message.bands)
     return Excitation(**_values(message, EXCITATION), **arrays, grid=grid, bands=bands)
 
 
-def bands_from_message(message: Any) -> tuple[PoleBand, ...]:
-    """Bands in which poles are wanted, of a message with the field ``bands``."""
-    return tuple(PoleBand(**_values(band, BAND)) for band in message.bands)
+def each_from_message(kind: type[Plain], messages: Iterable[Any]) -> tuple[Plain, ...]:
+    """Objects of numbers and texts, such as the bands in which poles are wanted, of their messages."""
+    return tuple(kind(**_values(message, _plain(kind))) for message in messages)
 
 
-def write_bands(message: Any, make: Callable[[], Any], bands: Sequence[PoleBand]) -> None:
-    """Fill the field ``bands`` with messages that `make` gives."""
-    _write_each(message.bands, make, BAND, bands)
+def write_each(target: list[Any], make: Callable[[], Any], sources: Sequence[Plain]) -> None:
+    """Append to a field of a message those of such objects; `make` gives messages."""
+    for source in sources:
+        target.append(make())
+        _write_values(target[-1], _plain(type(source)), source)
 
 
 def write_excitation(
@@ -97,7 +99,7 @@ def write_excitation(
     for name in EXCITATION_ARRAYS:
         fill(getattr(message, name), getattr(excitation, name))
     message.grid, message.level_v = GRIDS[excitation.grid], excitation.level_v
-    write_bands(message, make, excitation.bands)
+    write_each(message.bands, make, excitation.bands)
 
 
 def record_from_message(message: Any) -> Record:
@@ -200,18 +202,6 @@ def _write_band(message: Any, poles: Poles) -> None:
     for name in (*POLES_ARRAYS, *POLES_DRIFTS, *POLES_COVARIANCES):
         if (known := getattr(poles, name)) is not None:
             fill(getattr(message, name), known)
-
-
-def distortion_from_message(message: Any) -> tuple[BandDistortion, ...]:
-    """Distortion in each band, of a message with the field ``distortion``."""
-    return tuple(BandDistortion(**_values(band, DISTORTION)) for band in message.distortion)
-
-
-def write_distortion(
-    message: Any, make: Callable[[], Any], distortion: Sequence[BandDistortion]
-) -> None:
-    """Fill the field ``distortion`` with messages that `make` gives."""
-    _write_each(message.distortion, make, DISTORTION, distortion)
 
 
 def origin_from_message(message: Any) -> Origin:
@@ -375,12 +365,3 @@ def _write_values(message: Any, names: Iterable[str], source: object) -> None:
     for name in names:
         value = getattr(source, name)
         setattr(message, name, value.item() if isinstance(value, np.generic) else value)
-
-
-def _write_each(
-    target: list[Any], make: Callable[[], Any], names: Iterable[str], sources: Sequence[object]
-) -> None:
-    """Append a message of fields of equal name for each object."""
-    for source in sources:
-        target.append(make())
-        _write_values(target[-1], names, source)

@@ -18,7 +18,7 @@ from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import (
-    distortion_from_message,
+    each_from_message,
     poles_from_message,
     time_from_message,
 )
@@ -235,7 +235,7 @@ def from_message(message: Any) -> PointResult:
         **content,
         time_ns=time_from_message(message.header.stamp),
         frame_id=message.header.frame_id,
-        distortion=distortion_from_message(message),
+        distortion=each_from_message(BandDistortion, message.distortion),
         further=band_results(poles),
     )
 
