@@ -11,7 +11,7 @@ from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
 from tactile_resonance.simulation.ur5e import motion
 from tactile_resonance.simulation.ur5e.forces import ForceTask, ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
-from tactile_resonance.simulation.ur5e.machine import ExternalSensor, Machine
+from tactile_resonance.simulation.ur5e.machine import Machine
 from tactile_resonance.simulation.ur5e.poses import ZERO, Six, pose_from_transform, product
 from tactile_resonance.simulation.ur5e.registers import Script, Thread
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError, Target
@@ -243,9 +243,8 @@ class Handlers:
         """Use the wrench that the client sends, or the built-in sensor again."""
         script = self._script
         if script.integer(1) == 1:
-            self._machine.external = ExternalSensor(
-                script.double(0), script.vector(1), script.vector(4)
-            )
+            place_m = script.vector(1)
+            self._machine.external = ToolPayload(script.double(0), script.vector(4)), place_m
         else:
             self._machine.external = None
 

@@ -224,7 +224,7 @@ class UrController:
         try:
             if not self.program.step():
                 self._end_program("ended by its client")
-            self.machine.comply()
+            self.machine.force_mode.step(self.machine.tcp_force)
         except ProtectiveStop as stop:
             self.protective_stop(str(stop))
         except ScriptError as error:

@@ -15,7 +15,6 @@ file alone: whatever is compiled for it is in here).
 from __future__ import annotations
 
 import math
-from itertools import product as combinations
 
 from numba import float64, njit
 from numba.types import UniTuple
@@ -254,26 +253,6 @@ def _nearest(turn, place_m, near, joint_range_rad):
         if way < best[6]:
             best = (a, b, c, d, e, f, way)
     return best
-
-
-def inverse(flange: Transform, wrist_angle_rad: float = 0.0) -> list[Six]:
-    """Return every set of joint angles that brings the flange to a place, each in [-pi, pi].
-
-    Parameters
-    ----------
-    flange : Transform
-        The flange in the base.
-    wrist_angle_rad : float
-        Angle of joint 6 where axes 4 and 6 are parallel and only a sum of angles is determined.
-
-    Returns
-    -------
-    list of 6-tuples
-        At most eight; empty out of reach.
-    """
-    signs = combinations((1.0, -1.0), repeat=3)
-    solutions = [_solution(*flange, *each, wrist_angle_rad) for each in signs]
-    return [joints for joints in solutions if math.isfinite(sum(joints))]
 
 
 def nearest_inverse(flange: Transform, near: Six, joint_range_rad: float = math.tau) -> Six | None:

@@ -160,23 +160,6 @@ class MachineConfig:
     contact_force_n: float = 15.0
 
 
-@dataclass(frozen=True)
-class ExternalSensor:
-    """A force sensor whose wrench a client sends by RTDE in place of the built-in one.
-
-    Attributes
-    ----------
-    mass_kg : float
-        Of the sensor, part of the payload set.
-    offset_m, cog_m : Vector
-        Where it measures, and its centre of gravity, in the flange.
-    """
-
-    mass_kg: float
-    offset_m: Vector
-    cog_m: Vector
-
-
 class Machine:
     """The arm, moved by its target in steps of 2 ms.
 
@@ -190,8 +173,9 @@ class Machine:
         As the program set it.
     gravity_m_s2 : Vector
         Acceleration of free fall in the base.
-    external : ExternalSensor or None
-        Set while ``ft_rtde_input_enable`` is on.
+    external : (ToolPayload, Vector) or None
+        A force sensor whose wrench a client sends in place of the built-in one, while ``ft_rtde_input_enable``
+        is on: what it weighs, part of the payload set, and where it measures in the flange.
     external_wrench : 6 floats
         RTDE input ``external_force_torque``.
     tcp_force : 6 floats
@@ -210,7 +194,7 @@ class Machine:
         self.force_mode = ForceMode(self.target)
         self.payload = config.tool
         self.gravity_m_s2: Vector = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)
-        self.external: ExternalSensor | None = None
+        self.external: tuple[ToolPayload, Vector] | None = None
         self.external_wrench = ZERO
         self.tcp_force = ZERO
         self._tip = transform_from_pose(config.tip_in_flange)
@@ -264,10 +248,6 @@ class Machine:
         """Take vibration and noise of the sensor from a generator, from the next step on."""
         self.joints.reseed(int(random.integers(2**31)))
         self.sensor.reseed(random)
-
-    def comply(self) -> None:
-        """Let force mode move the target aside; raises as `Target.command`."""
-        self.force_mode.step(self.tcp_force)
 
     def step(self, powered: bool) -> None:
         """Follow the target for one cycle and feel what the tool touches."""
@@ -346,9 +326,9 @@ class Machine:
         weight = self.payload.weight(turn, self.gravity_m_s2)
         measured = None
         if self.external is not None:
-            own = ToolPayload(self.external.mass_kg, self.external.cog_m)
+            own, place_m = self.external
             weight = difference(weight, own.weight(turn, self.gravity_m_s2))
-            measured = moved_wrench(self.external_wrench, (NO_TURN, self.external.offset_m))
+            measured = moved_wrench(self.external_wrench, (NO_TURN, place_m))
         self.sensor.step(wrench, weight, measured)
         self.tcp_force = self.sensor.at_tcp(turn, self.target.tcp[1])
         self._history.append((self.posture.q, self.tcp_force))

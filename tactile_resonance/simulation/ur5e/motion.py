@@ -9,7 +9,7 @@ model's choice is stated at the function. Moves from rest to rest have a trapezo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from tactile_resonance.contact.vectors import transposed, turn_product
@@ -24,6 +24,7 @@ from tactile_resonance.simulation.ur5e.poses import (
     turn_between,
     turned,
 )
+from tactile_resonance.simulation.ur5e.registers import Thread
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
 
 
@@ -68,8 +69,6 @@ class Trapezoid:
         return self.peak * (time - ramp / 2), self.peak
 
 
-Motion = Generator[None, None, None]
-
 # Postures along a joint move at which the speed of the TCP is looked at, and the margin between.
 _SPEED_CHECKS = 33
 _SPEED_MARGIN = 0.98
@@ -81,7 +80,7 @@ _SLOWEST = 1e-9
 SERVO_ACCELERATION_RAD_S2 = 40.0
 
 
-def movej(target: Target, goal: Six, acceleration: float, speed: float) -> Motion:
+def movej(target: Target, goal: Six, acceleration: float, speed: float) -> Thread:
     """Move all joints to `goal`, together; acceleration [rad/s^2] and speed of the leading one.
 
     Begun in motion, it brakes first. The speed is lowered where a joint or the TCP would pass its
@@ -120,7 +119,7 @@ def movej(target: Target, goal: Six, acceleration: float, speed: float) -> Motio
         yield
 
 
-def movel(target: Target, goal: Transform, acceleration: float, speed: float) -> Motion:
+def movel(target: Target, goal: Transform, acceleration: float, speed: float) -> Thread:
     """Move the TCP straight to a transform `goal`, turning about one axis meanwhile.
 
     Acceleration [m/s^2] and speed [m/s] hold for the way of the TCP or, numerically, for the angle
@@ -156,7 +155,7 @@ def movel(target: Target, goal: Transform, acceleration: float, speed: float) ->
         yield
 
 
-def speedl(target: Target, twist: Six, acceleration: float, time_s: float = 0.0) -> Motion:
+def speedl(target: Target, twist: Six, acceleration: float, time_s: float = 0.0) -> Thread:
     """Bring the TCP to a twist [m/s, rad/s] in the base.
 
     Returns after `time_s`, or once the twist is reached where that is 0. The acceleration [m/s^2]
@@ -169,7 +168,7 @@ def speedl(target: Target, twist: Six, acceleration: float, time_s: float = 0.0)
     yield from _repeated(lambda: _step_twist(target, goal, acceleration), time_s)
 
 
-def speedj(target: Target, speeds: Six, acceleration: float, time_s: float = 0.0) -> Motion:
+def speedj(target: Target, speeds: Six, acceleration: float, time_s: float = 0.0) -> Thread:
     """Bring the joints to speeds [rad/s]; `acceleration` [rad/s^2] is that of the leading one.
 
     Returns after `time_s`, or once the speeds are reached where that is 0.
@@ -180,7 +179,7 @@ def speedj(target: Target, speeds: Six, acceleration: float, time_s: float = 0.0
     yield from _repeated(lambda: _step_joints(target, goal, acceleration), time_s)
 
 
-def _repeated(step: Callable[[], bool], time_s: float) -> Motion:
+def _repeated(step: Callable[[], bool], time_s: float) -> Thread:
     """Step for a time or, where that is 0, until a step says that the speed is reached."""
     time = 0.0
     while True:
@@ -191,7 +190,7 @@ def _repeated(step: Callable[[], bool], time_s: float) -> Motion:
             return
 
 
-def stopl(target: Target, deceleration: float) -> Motion:
+def stopl(target: Target, deceleration: float) -> Thread:
     """Stop the TCP on a straight line; deceleration [m/s^2], numerically that of turning too."""
     _require_positive("stopl", "deceleration", deceleration)
     while any(target.qd):
@@ -199,7 +198,7 @@ def stopl(target: Target, deceleration: float) -> Motion:
         yield
 
 
-def stopj(target: Target, deceleration: float) -> Motion:
+def stopj(target: Target, deceleration: float) -> Thread:
     """Stop the joints in proportion; deceleration of the leading one [rad/s^2]."""
     _require_positive("stopj", "deceleration", deceleration)
     while any(target.qd):
@@ -207,7 +206,7 @@ def stopj(target: Target, deceleration: float) -> Motion:
         yield
 
 
-def servoj(target: Target, goal: Six, time_s: float, lookahead_s: float) -> Motion:
+def servoj(target: Target, goal: Six, time_s: float, lookahead_s: float) -> Thread:
     """Follow joint angles `goal` for a time, beside them by what force mode has yielded.
 
     The model's choice: the joints approach the goal with the look-ahead time as time constant, under

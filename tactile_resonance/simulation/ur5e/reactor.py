@@ -7,6 +7,7 @@ import select
 import socket
 import struct
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
@@ -49,7 +50,6 @@ class Connection:
         self.port, self.peer_port = listener.port, int(channel.getpeername()[1])
         self._socket = channel
         self._unsent = bytearray()
-        self._gathered = bytearray()
         self._most_unsent = listener.most_unsent
         self.freezable = listener.freezable
         self.frozen = self._patient = False
@@ -79,14 +79,14 @@ class Connection:
         if not self.is_open or (droppable and (self._unsent or self.frozen)):
             return False
         if self._reactor.gathers:
-            self._gathered += data
-            self._reactor.gathered.add(self)
+            self._reactor.gathered[self] += data
             return True
         if len(self._unsent) > self._most_unsent:
             self.close()
             return False
         if self._unsent or self.frozen:
             self._unsent += data
+            self._reactor.unsent.add(self)
             return True
         try:
             sent = self._socket.send(data)
@@ -99,17 +99,6 @@ class Connection:
             self._unsent += data[sent:]
             self._reactor.unsent.add(self)
         return True
-
-    def send_gathered(self) -> None:
-        """Send what was gathered."""
-        data = bytes(self._gathered)
-        self._gathered.clear()
-        self.send(data)
-
-    @property
-    def holds_data(self) -> bool:
-        """Whether something waits to be sent."""
-        return bool(self._unsent)
 
     def flush(self) -> None:
         """Send what waits, as far as the network takes it."""
@@ -207,15 +196,15 @@ class Reactor:
         Nothing passes the freezable ports.
     unsent : set of Connection
         Those for which data wait.
-    gathered : set of Connection
-        Those for which data were gathered.
+    gathered : dict
+        What waits to be sent together, by the connection.
     """
 
     def __init__(self, host: str) -> None:
         self.host = host
         self.frozen = self._gathers = False
         self.unsent: set[Connection] = set()
-        self.gathered: set[Connection] = set()
+        self.gathered: dict[Connection, bytearray] = defaultdict(bytearray)
         self._listeners: list[_Listener] = []
         self._connections: set[Connection] = set()
         # what is called where a descriptor can be read, and the descriptors as select takes them
@@ -232,7 +221,8 @@ class Reactor:
     def gathers(self, value: bool) -> None:
         self._gathers = value
         while self.gathered and not value:
-            self.gathered.pop().send_gathered()
+            connection, data = self.gathered.popitem()
+            connection.send(bytes(data))
 
     def listen(
         self,
@@ -292,8 +282,6 @@ class Reactor:
         self.frozen = frozen
         for connection in self._connections:
             connection.frozen = frozen and connection.freezable
-            if connection.holds_data:
-                self.unsent.add(connection)
         self.renew()
 
     def forget(self, connection: Connection) -> None:

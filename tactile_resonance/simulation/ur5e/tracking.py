@@ -12,7 +12,7 @@ import numpy as np
 from numba import float64, njit
 from numba.types import UniTuple
 
-from tactile_resonance.fields import require
+from tactile_resonance.fields import check_above_zero, check_not_negative
 from tactile_resonance.simulation.noise import NormalRows, Seed
 
 
@@ -38,11 +38,8 @@ class TrackingParameters:
     jitter_corner_rad_s: float = 50.0
 
     def __post_init__(self) -> None:
-        for name in ("dead_time_s", "lag_s", "jitter_rms_m"):
-            value = getattr(self, name)
-            require(0 <= value < math.inf, name, value, "a number, 0 or above")
-        corner = self.jitter_corner_rad_s
-        require(0 < corner < math.inf, "jitter_corner_rad_s", corner, "a number above 0")
+        check_not_negative(self, "dead_time_s", "lag_s", "jitter_rms_m")
+        check_above_zero(self, "jitter_corner_rad_s")
 
 
 class Lag:

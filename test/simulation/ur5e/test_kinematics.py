@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """UR5e: forward and inverse against a product of exponentials made from the drawing's lengths."""
 
+import itertools
 import sys
 from pathlib import Path
 
@@ -42,8 +43,11 @@ def product_of_exponentials(q: np.ndarray) -> np.ndarray:
     return pose @ HOME
 
 
-def inverse(wanted: np.ndarray, *wrist_angle: float) -> list[tuple[float, ...]]:
-    return kinematics.inverse(transform(wanted), *wrist_angle)
+def inverse(wanted: np.ndarray, wrist_angle: float = 0.0) -> list[tuple[float, ...]]:
+    """All solutions, of which `nearest_inverse` takes one."""
+    signs = itertools.product((1.0, -1.0), repeat=3)
+    found = [kinematics._solution(*transform(wanted), *each, wrist_angle) for each in signs]
+    return [joints for joints in found if np.isfinite(joints).all()]
 
 
 def nearest_inverse(wanted: np.ndarray, near: np.ndarray):
