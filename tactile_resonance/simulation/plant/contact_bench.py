@@ -145,7 +145,9 @@ class VirtualArm:
 
     def speed(self, twist: Sequence[float], acceleration_m_s2: float) -> None:
         """Move with a twist until the next command."""
-        if self._may_move():
+        self._raise_if(self._broken if self._connected else ArmFault.LINK_LOST)
+        if self._heard():
+            self._raise_if(self._stopped)
             self._motion.speed(twist, acceleration_m_s2)
 
     def stop(self, deceleration_m_s2: float) -> None:
@@ -196,13 +198,6 @@ class VirtualArm:
             return False
         self._heard_ns = self._bench.time_ns
         return True
-
-    def _may_move(self) -> bool:
-        self._raise_if(self._broken if self._connected else ArmFault.LINK_LOST)
-        heard = self._heard()
-        if heard:
-            self._raise_if(self._stopped)
-        return heard
 
     def _fresh(self) -> ArmSample:
         bench, motion = self._bench, self._motion

@@ -150,7 +150,7 @@ class SimulatedRobot:
         self.time.repeats.append(self.rtde.repeat)
         self.time.stalled.append(self._stood_still)
         self.time.robot_sent_ns = self.rtde.sent_ns
-        self.time.packets_arrived = self._packets_arrived
+        self.time.packets_arrived = lambda: None if self.reactor.frozen else self.rtde.packets
         try:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
             self.reactor.listen(dashboard.PORT, partial(dashboard.DashboardService, controller))
@@ -189,9 +189,6 @@ class SimulatedRobot:
     def _stood_still(self, seconds: float) -> None:
         """The robot's time stamps go on with the wall clock, as if packets had been lost."""
         self.controller.stood_still_s += seconds
-
-    def _packets_arrived(self) -> int | None:
-        return None if self.reactor.frozen else self.rtde.packets
 
     def _own_orders(self) -> dict[str, Callable[[dict], dict]]:
         """What the control port does for the robot itself."""

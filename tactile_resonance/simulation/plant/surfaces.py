@@ -187,11 +187,7 @@ class LaidScene:
         """The undisturbed surface in the base."""
         return FlatSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
 
-    def on_table(self, position_m: FloatArray) -> FloatArray:
-        """Point (3,) of the surface in the scene's frame, under a place (3,) in the base."""
-        place = self.table.rotation.inv().apply(position_m - self.table.position_m)
-        return np.array([place[0], place[1], 0.0])
-
     def tissue_at(self, position_m: FloatArray) -> Tissue | None:
         """What the tip touches under a place (3,) in the base."""
-        return self.scene.tissue_at(self.on_table(position_m))
+        x, y, _ = self.table.rotation.inv().apply(position_m - self.table.position_m)
+        return self.scene.tissue_at(np.array([x, y, 0.0]))

@@ -12,6 +12,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from itertools import takewhile
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +48,9 @@ class _PlantStep(NamedTuple):
     depth_m: float
 
 
+_NOW = attrgetter(*_PlantStep._fields)  # of a plant
+
+
 class PlantHistory:
     """Time, place of the tip and its contact, step by step.
 
@@ -69,15 +73,7 @@ class PlantHistory:
         """Note what is true now; to be called after each step of the plant."""
         plant = self._plant
         self.largest_force_n = max(self.largest_force_n, plant.normal_force_n)
-        self._steps.append(
-            _PlantStep(
-                plant.time_s,
-                plant.tip_m,
-                plant.normal_force_n,
-                plant.contact_radius_m,
-                plant.depth_m,
-            )
-        )
+        self._steps.append(_PlantStep._make(_NOW(plant)))
 
     def contact_over(self, fields: dict) -> dict:
         """Control port: the contact from field ``after_s`` to ``until_s``, means over so many equal ``parts``.
@@ -153,6 +149,10 @@ class BenchSetup:
         require(abs(self.tilt_rad) <= 0.35, "tilt_rad", self.tilt_rad, "-0.35 to 0.35 (20 degrees)")
         require(math.isfinite(self.azimuth_rad), "azimuth_rad", self.azimuth_rad, "a number")
 
+    def surface(self) -> FlatSurface:
+        """The undisturbed surface."""
+        return FlatSurface.tilted(self.surface_height_m, self.tilt_rad, self.azimuth_rad)
+
 
 class Tabletop:
     """The plant with what can be exchanged on it while it runs.
@@ -174,7 +174,7 @@ class Tabletop:
         self._tissue: Tissue | None = library[setup.tissue]
         self._scene = laid
         if laid is None:
-            surface = FlatSurface.tilted(setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad)
+            surface = setup.surface()
         else:
             surface = laid.surface()
             # what is computed once must not hold up the first touch
@@ -192,14 +192,11 @@ class Tabletop:
 
     def place_surface(self, fields: dict) -> dict:
         """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
-        setup = BenchSetup(
+        self.plant.surface = BenchSetup(
             surface_height_m=number(fields.get("height_m"), "height_m"),
             tilt_rad=number(fields.get("tilt_rad", 0.0), "tilt_rad"),
             azimuth_rad=number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
-        )
-        self.plant.surface = FlatSurface.tilted(
-            setup.surface_height_m, setup.tilt_rad, setup.azimuth_rad
-        )
+        ).surface()
         return {}
 
     def move_surface(self, fields: dict) -> dict:
@@ -220,19 +217,11 @@ class Tabletop:
 
     def truth(self, _: dict) -> dict:
         """Control port: the true state of the contact."""
-        plant = self.plant
-        return {
-            "time_s": plant.time_s,
-            "tip_m": plant.tip_m,
-            "site_m": plant.site_m,
-            "force_n": plant.force_n,
-            "normal_force_n": plant.normal_force_n,
-            "contact_s": plant.contact_s,
-            "depth_m": plant.depth_m,
-            "contact_radius_m": plant.contact_radius_m,
-            "in_contact": plant.in_contact,
-            "touches": plant.touches,
-        }
+        names = (
+            *("time_s", "tip_m", "site_m", "force_n", "normal_force_n", "contact_s", "depth_m"),
+            *("contact_radius_m", "in_contact", "touches"),
+        )
+        return {name: getattr(self.plant, name) for name in names}
 
 
 def attach(robot: SimulatedRobot, tabletop: Tabletop) -> None:

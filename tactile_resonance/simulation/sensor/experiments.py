@@ -9,7 +9,8 @@ The spreads between positions and preparations are chosen (mark C) so that the o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -224,7 +225,8 @@ def records_of_calibration(
         coupled = couple(bench.sensor, _known_load(kind, value) if value else None)
         if kind == "loopback":
             nothing = np.zeros(0, complex)
-            coupled = _Wire(PoleResidueModel(nothing, nothing, 1.0))  # type: ignore[assignment]
+            wire = PoleResidueModel(nothing, nothing, 1.0)  # both channels on the generator
+            coupled = SimpleNamespace(modal=wire)  # type: ignore[assignment]
         run = BenchRun(bench.sensor, coupled, seed + index, effects)
         run.block(excitation, settling)
         block = run.block(excitation, periods)
@@ -246,13 +248,6 @@ def calibration_records(bench: SimulatedBench, **options: Any) -> list[Calibrati
         )
         for kind, value, u, y in made
     ]
-
-
-@dataclass(frozen=True)
-class _Wire:
-    """Both channels on the generator."""
-
-    modal: PoleResidueModel
 
 
 def _known_load(kind: str, value: float) -> HertzContact:

@@ -194,28 +194,6 @@ def free_decay(
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Plan:
-    """What one excitation needs once.
-
-    Attributes
-    ----------
-    lines : Lines
-    period : (samples_per_period,) array
-        Steady state, delayed by a part of an interval.
-    state : (K,) array
-        Of the poles at time zero of the excitation, in steady state.
-    late, part_s : int, float
-        The delay: output n is the response at ``(n - late) interval + part``.
-    """
-
-    lines: Lines
-    period: FloatArray
-    state: ComplexArray
-    late: int
-    part_s: float
-
-
 class ResponseStream:
     """The response of a linear system, from rest, to one excitation after another.
 
@@ -241,7 +219,7 @@ class ResponseStream:
         self._model = model
         self._delay_s = delay_s
         self._negligible_v = negligible_v
-        self._plan: _Plan | None = None
+        self._lines: Lines | None = None  # played at present
         self._phase = 0  # samples of the current period already played
         # state minus steady state: it only decays, so it loses no digits over many periods
         self._deviation = np.zeros(model.poles_rad_s.size, dtype=complex)
@@ -250,20 +228,19 @@ class ResponseStream:
     @property
     def state(self) -> ComplexArray:
         """Modal state ``z`` at the end of what was played (not delayed), shape (K,)."""
-        if self._plan is None:
+        if self._lines is None:
             return self._deviation.copy()
         if self._phase == 0:
-            return self._plan.state + self._deviation
-        now_s = self._phase / self._plan.lines.sample_rate_hz
-        return steady_state(self._model, self._plan.lines, now_s) + self._deviation
+            return self._steady + self._deviation
+        now_s = self._phase / self._lines.sample_rate_hz
+        return steady_state(self._model, self._lines, now_s) + self._deviation
 
     def continued(self, model: PoleResidueModel, state: ComplexArray) -> ResponseStream:
         """Return a stream of another model that goes on from here, in a given state (K,)."""
         other = ResponseStream(model, delay_s=self._delay_s, negligible_v=self._negligible_v)
         other._phase, other._late = self._phase, self._late.copy()
-        if self._plan is not None:
-            lines = self._plan.lines
-            other._plan = other._make_plan(lines)
+        if (lines := self._lines) is not None:
+            other._prepare(lines)
             state = state - steady_state(model, lines, self._phase / lines.sample_rate_hz)
         other._deviation = state
         return other
@@ -287,38 +264,41 @@ class ResponseStream:
         samples = lines.samples_per_period if samples is None else samples
         accepted = f"1 to samples_per_period = {lines.samples_per_period}"
         require(1 <= samples <= lines.samples_per_period, "samples", samples, accepted)
-        plan, rate_hz = self._take_up(lines), lines.sample_rate_hz
+        self._take_up(lines)
+        rate_hz = lines.sample_rate_hz
         played = np.arange(self._phase, self._phase + samples)
         self._phase = (self._phase + samples) % lines.samples_per_period
-        floor = max(NEGLIGIBLE * float(np.abs(plan.state).max(initial=0.0)), self._negligible_v)
-        response = plan.period.take(played, mode="wrap") + free_decay(
-            self._model, self._deviation, samples, 1 / rate_hz, plan.part_s, floor
+        floor = max(NEGLIGIBLE * float(np.abs(self._steady).max(initial=0.0)), self._negligible_v)
+        response = self._period.take(played, mode="wrap") + free_decay(
+            self._model, self._deviation, samples, 1 / rate_hz, self._part_s, floor
         )
         self._deviation = self._deviation * np.exp(self._model.poles_rad_s * (samples / rate_hz))
-        if plan.late == 0:
+        if self._late_samples == 0:
             return response
-        late = self._late if self._late.size else np.zeros(plan.late)
+        late = self._late if self._late.size else np.zeros(self._late_samples)
         joined = np.concatenate([late, response])
         self._late = joined[samples:]
         return joined[:samples]
 
-    def _take_up(self, lines: Lines) -> _Plan:
-        """Return the plan of an excitation; a new one starts here, from the present state."""
-        if self._plan is None or not lines.same_signal(self._plan.lines):
-            if self._plan is not None:
-                rate_hz = self._plan.lines.sample_rate_hz
+    def _take_up(self, lines: Lines) -> None:
+        """Begin an excitation here, from the present state, unless it is played already."""
+        if not lines.same_signal(self._lines):
+            if self._lines is not None:
+                rate_hz = self._lines.sample_rate_hz
                 accepted = f"{rate_hz:g}, that of what was played before"
                 require(lines.sample_rate_hz == rate_hz, "sample_rate_hz", lines.sample_rate_hz, accepted)
             state = self.state
-            self._plan, self._phase = self._make_plan(lines), 0
-            self._deviation = state - self._plan.state
-        return self._plan
+            self._prepare(lines)
+            self._phase, self._deviation = 0, state - self._steady
 
-    def _make_plan(self, lines: Lines) -> _Plan:
+    def _prepare(self, lines: Lines) -> None:
+        """Work out what an excitation needs once."""
+        self._lines = lines
         interval_s = 1 / lines.sample_rate_hz
         # a delay of a whole number of intervals, up to rounding, is exactly that
         late = int(np.ceil(self._delay_s / interval_s - 1e-9))
-        part_s = max(0.0, late * interval_s - self._delay_s)
+        # output n is the response at (n - late) interval + part
+        self._late_samples, self._part_s = late, max(0.0, late * interval_s - self._delay_s)
         gain = self._model.frequency_response(lines.frequency_hz)
-        period = sample_period(lines, gain, shift_s=part_s)
-        return _Plan(lines, period, steady_state(self._model, lines), late, part_s)
+        self._period = sample_period(lines, gain, shift_s=self._part_s)
+        self._steady = steady_state(self._model, lines)  # at time zero of the excitation

@@ -147,26 +147,6 @@ def uniform(tissue: Tissue) -> Material:
     return lambda position_m: tissue
 
 
-def gradient(start_m: Vector, end_m: Vector, tissue_between: Callable[[float], Tissue]) -> Material:
-    """Return a tissue that changes along the way from one point to another, constant beyond both.
-
-    Parameters
-    ----------
-    start_m, end_m : tuple of 3 floats
-    tissue_between : callable
-        Tissue at a share of the way, 0 (start) to 1 (end).
-    """
-    start = np.asarray(start_m)
-    way = np.asarray(end_m) - start
-
-    def tissue_at(position_m: FloatArray) -> Tissue:
-        # at the foot of the perpendicular on the way
-        share = float((position_m - start) @ way / (way @ way))
-        return tissue_between(min(1.0, max(0.0, share)))
-
-    return tissue_at
-
-
 @dataclass(frozen=True)
 class RandomField:
     """A Gaussian random field of unit variance, correlation ``exp(-r^2 / (2 l^2))``.
@@ -201,26 +181,6 @@ class RandomField:
         vectors, phases = self._waves
         wave = np.cos(np.asarray(position_m, dtype=float) @ vectors + phases)  # (..., waves)
         return np.asarray(np.sqrt(2 / WAVES) * wave.sum(axis=-1))
-
-
-def heterogeneous(material: Material, field: RandomField, modulus_spread: float) -> Material:
-    """Return a material whose modulus varies at random: log-normal with mean 1, ratios unchanged.
-
-    Parameters
-    ----------
-    material : Material
-    field : RandomField
-    modulus_spread : float
-        Standard deviation of ln E.
-    """
-
-    def tissue_at(position_m: FloatArray) -> Tissue:
-        tissue = material(position_m)
-        exponent = modulus_spread * field.value(position_m) - modulus_spread**2 / 2
-        modulus = tissue.relaxation_modulus_1s_pa * float(np.exp(exponent))
-        return replace(tissue, relaxation_modulus_1s_pa=modulus, gelatine_percent=None)
-
-    return tissue_at
 
 
 def mixture(first: Tissue, second: Tissue, share: float, modulus_1s_pa: float) -> Tissue:
@@ -282,28 +242,50 @@ class GradientEntry:
         require(apart, "end_m", self.end_m, "a point other than start_m")
 
     def gradient_of(self, library: TissueLibrary) -> Material:
-        """Return what lies there: gelatine between two of gelatine, else a mixture."""
+        """Return what lies there, constant beyond both: gelatine between two of gelatine, else a mixture."""
         first = build(self.from_.tissue_of, "from", library)
         second = build(self.to.tissue_of, "to", library)
         low, high = first.gelatine_percent, second.gelatine_percent
 
-        def between(share: float) -> Tissue:
+        start = np.asarray(self.start_m)
+        way = np.asarray(self.end_m) - start
+
+        def tissue_at(position_m: FloatArray) -> Tissue:
+            # at the foot of the perpendicular on the way
+            share = min(1.0, max(0.0, float((position_m - start) @ way / (way @ way))))
             if low is None or high is None:
                 return geometric_mixture(first, second, share)
             return library.gelatine(low + share * (high - low))
 
-        return gradient(self.start_m, self.end_m, between)
+        return tissue_at
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeterogeneityEntry(RandomField):
-    """Part of a file: a random field, and how far the modulus follows it; see `heterogeneous`."""
+    """Part of a file: a random field, and how far the modulus follows it.
+
+    Attributes
+    ----------
+    modulus_spread : float
+        Standard deviation of ln E.
+    """
 
     modulus_spread: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_within(self, modulus_spread=(0, 1))
+
+    def over(self, material: Material) -> Material:
+        """Return a material whose modulus varies at random: log-normal with mean 1, ratios unchanged."""
+
+        def tissue_at(position_m: FloatArray) -> Tissue:
+            tissue, spread = material(position_m), self.modulus_spread
+            exponent = spread * self.value(position_m) - spread**2 / 2
+            modulus = tissue.relaxation_modulus_1s_pa * float(np.exp(exponent))
+            return replace(tissue, relaxation_modulus_1s_pa=modulus, gelatine_percent=None)
+
+        return tissue_at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,5 +304,4 @@ class FillingEntry(TissueEntry):
             given = [value for value in (self.tissue, self.gelatine_percent) if value is not None]
             require(not given, "gradient", given, "no tissue beside a gradient")
             material = build(self.gradient.gradient_of, "gradient", library)
-        field = self.heterogeneity
-        return material if field is None else heterogeneous(material, field, field.modulus_spread)
+        return material if self.heterogeneity is None else self.heterogeneity.over(material)

@@ -16,10 +16,11 @@ from tactile_resonance.mechanics.indentation import BallTip
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import (
+    GradientEntry,
+    HeterogeneityEntry,
     RandomField,
+    TissueEntry,
     geometric_mixture,
-    gradient,
-    heterogeneous,
     mixture,
     uniform,
 )
@@ -140,9 +141,9 @@ def test_inclusions_are_felt_more_the_shallower_and_the_nearer(library):
 
 
 def test_gelatine_gradient_is_linear_in_concentration(library):
-    material = gradient(
-        (0.0, 0.0, 0.0), (0.1, 0.0, 0.0), lambda share: library.gelatine(10 + 6 * share)
-    )
+    ends = [TissueEntry(gelatine_percent=percent) for percent in (10.0, 16.0)]
+    entry = GradientEntry(from_=ends[0], to=ends[1], start_m=(0.0, 0.0, 0.0), end_m=(0.1, 0.0, 0.0))
+    material = entry.gradient_of(library)
     for x, percent in ((-1, 10), (0, 10), (0.05, 13), (0.1, 16), (0.5, 16)):
         assert material(np.array([x, 0.3, -0.1])).gelatine_percent == pytest.approx(percent)
 
@@ -177,8 +178,8 @@ def test_random_field_has_the_stated_correlation():
 
 def test_heterogeneity_repeats_and_keeps_the_mean_modulus(library):
     gel = library["gel10"]
-    material = heterogeneous(uniform(gel), RandomField(2e-3, 7), 0.1)
-    again = heterogeneous(uniform(gel), RandomField(2e-3, 7), 0.1)
+    material = HeterogeneityEntry(2e-3, 7, modulus_spread=0.1).over(uniform(gel))
+    again = HeterogeneityEntry(2e-3, 7, modulus_spread=0.1).over(uniform(gel))
     place = np.array([0.01, -0.02, 0.0])
     assert material(place) == again(place)
     x = np.linspace(0, 2.0, 2001)  # a thousand correlation lengths
