@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 from tactile_resonance.simulation.cell.transducer import (
     SAMPLE_PERIOD_S,
-    CellFaults,
     CellParameters,
     Transducer,
 )
@@ -59,12 +58,11 @@ class LoadCell:
     faults : CellFaults
         May be set at any time.
     streaming : bool
-    rate_hz : float
-        Wrenches a second while it streams; 200 after power-up.
     """
 
     def __init__(self, parameters: CellParameters, seed: Seed = 1) -> None:
         self._transducer = Transducer(parameters, seed)
+        self.faults = self._transducer.faults
         self._model = parameters.name
         self._next_ids = (COMMAND_ID, *RESPONSE_IDS)
         self.streaming = False
@@ -75,16 +73,6 @@ class LoadCell:
         self._wrench: tuple[float, ...] = (0.0,) * 6
         self._counts: tuple[int, ...] = (0,) * 6
         self._bits = 0
-
-    @property
-    def faults(self) -> CellFaults:
-        """What is wrong with it at present."""
-        return self._transducer.faults
-
-    @property
-    def rate_hz(self) -> float:
-        """Wrenches a second while it streams."""
-        return 1 / (self._decimation * SAMPLE_PERIOD_S)
 
     def reseed(self, seed: Seed) -> None:
         """Take all noise from the next conversion on from a seed, whatever was drawn before."""
@@ -157,7 +145,7 @@ class LoadCell:
             good = kind in (0, 1) and code < len(FILTERS_HZ)
             if good:
                 self._filter_code = code if kind else 0
-                self._transducer.cutoff_hz = FILTERS_HZ[self._filter_code]
+                self._transducer.set_low_pass(FILTERS_HZ[self._filter_code])
             return _result(good)
         if command == READ_FILTER:
             return bytes([1 if self._filter_code else 0, self._filter_code])

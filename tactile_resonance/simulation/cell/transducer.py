@@ -183,7 +183,7 @@ class Transducer:
         self._axes["drift"] = [p.force_drift_n_per_s * SAMPLE_PERIOD_S] * 3 + [0.0] * 3
         self._axes["offset"] = [*p.force_bias_n, *p.torque_bias_nm]
         self._read = False  # whether there is a reading
-        self.cutoff_hz = 0.0
+        self._keep = 0.0  # of the low-pass, off
         self.reseed(seed)
 
     @property
@@ -191,15 +191,9 @@ class Transducer:
         """How often each axis went beyond its range, (6,)."""
         return self._axes["overloads"].tolist()
 
-    @property
-    def cutoff_hz(self) -> float:
-        """Corner of the first-order low-pass [Hz]; 0: off."""
-        return self._cutoff_hz
-
-    @cutoff_hz.setter
-    def cutoff_hz(self, value: float) -> None:
-        self._cutoff_hz = value
-        self._keep = math.exp(-2 * math.pi * value * SAMPLE_PERIOD_S) if value > 0 else 0.0
+    def set_low_pass(self, corner_hz: float) -> None:
+        """Set the corner of the first-order low-pass [Hz]; 0: off."""
+        self._keep = math.exp(-2 * math.pi * corner_hz * SAMPLE_PERIOD_S) if corner_hz > 0 else 0.0
 
     def reseed(self, seed: Seed) -> None:
         """Take all noise from the next conversion on from a seed, that in the filter's memory too."""

@@ -37,7 +37,7 @@ class DashboardService(MessageService):
             "robotmode": lambda: f"Robotmode: {c.safety.robot_mode.name}",
             "safetymode": lambda: f"Safetymode: {c.safety.safety_mode.name}",
             "safetystatus": lambda: f"Safetystatus: {c.safety.safety_mode.name}",
-            "programState": lambda: f"{self._program_state()} rtde_control",
+            "programState": lambda: f"{'PLAYING' if self._running() else 'STOPPED'} rtde_control",
             "running": lambda: f"Program running: {str(self._running()).lower()}",
             "is in remote control": lambda: str(c.remote_control).lower(),
             "isProgramSaved": lambda: "true",
@@ -100,6 +100,3 @@ class DashboardService(MessageService):
 
     def _running(self) -> bool:
         return self._controller.runtime_state is RuntimeState.PLAYING
-
-    def _program_state(self) -> str:
-        return "PLAYING" if self._running() else "STOPPED"

@@ -241,17 +241,8 @@ class _Service:
 
         `known` holds packets of this cycle by their variables and is added to.
         """
-        if self._started and not cycle % self._period:
-            self._send_outputs(known)
-
-    def repeat(self) -> None:
-        """Send the newest outputs again, to whom none were sent yet those of now."""
-        if self._started and self._newest:
-            self.connection.send(self._newest, droppable=True)
-        elif self._started:
-            self._send_outputs({})
-
-    def _send_outputs(self, known: dict[tuple[str, ...], bytes]) -> None:
+        if not self._started or cycle % self._period:
+            return
         recipe, controller = self._outputs, self._server.controller
         assert recipe is not None
         data = known.get(recipe.names)
@@ -261,6 +252,13 @@ class _Service:
         self._newest = data
         if self.connection.send(data, droppable=True):
             self.sent_ns = round((controller.time_s + controller.stood_still_s) * 1e9)
+
+    def repeat(self) -> None:
+        """Send the newest outputs again, to whom none were sent yet those of now."""
+        if self._started and self._newest:
+            self.connection.send(self._newest, droppable=True)
+        else:
+            self.publish(0, {})
 
     def _protocol_version(self, payload: bytes) -> bytes:
         return bytes([payload == struct.pack(">H", PROTOCOL_VERSION)])

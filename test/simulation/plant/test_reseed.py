@@ -88,7 +88,7 @@ def test_transducers_with_different_histories_have_the_noise_of_one_seed(seed, c
     found = []
     for construction, before in ((1, 10), (2, 3 * ROWS + 5)):
         transducer = Transducer(CELL, construction)
-        transducer.cutoff_hz = cutoff_hz
+        transducer.set_low_pass(cutoff_hz)
         readings(transducer, before)
         transducer.reseed(seed)
         found.append(readings(transducer, 3 * ROWS))
@@ -99,7 +99,7 @@ def test_transducers_with_different_histories_have_the_noise_of_one_seed(seed, c
 @pytest.mark.parametrize("cutoff_hz", [0.0, 5.0])
 def test_what_the_filter_remembers_of_the_noise_is_stationary_from_the_first_reading(cutoff_hz):
     transducer = Transducer(CELL)
-    transducer.cutoff_hz = cutoff_hz
+    transducer.set_low_pass(cutoff_hz)
     keep = np.exp(-2 * np.pi * cutoff_hz * 0.001) if cutoff_hz else 0.0
     first, later = [], []
     for seed in range(400):
