@@ -86,7 +86,13 @@ class Excitation:
                 accepted = {"i": "signed integers", "f": "real numbers"}[kind]
                 raise ValueError(f"{name}: values of type {given}, expected {accepted}")
         _check_period(self.sample_rate_hz, self.samples_per_period)
-        _check_harmonics(self.harmonics, self.samples_per_period)
+        harmonics, last = self.harmonics, (self.samples_per_period - 1) // 2
+        if harmonics.ndim != 1 or harmonics.size == 0:
+            raise ValueError(f"harmonics: shape {harmonics.shape}, expected (F,) with F >= 1")
+        if harmonics[0] < 1 or harmonics[-1] > last or np.any(np.diff(harmonics) < 1):
+            raise ValueError(
+                f"harmonics: {harmonics[0]}..{harmonics[-1]}, expected ascending, from 1 to {last}"
+            )
         for name in ("amplitude_v", "phase_rad"):
             array = getattr(self, name)
             if array.shape != self.harmonics.shape or not np.all(np.isfinite(array)):
@@ -395,13 +401,3 @@ def _check_period(sample_rate_hz: float, samples_per_period: int) -> None:
         raise ValueError(f"sample_rate_hz: {sample_rate_hz}, expected a positive frequency")
     if samples_per_period < 4:
         raise ValueError(f"samples_per_period: {samples_per_period}, expected at least 4")
-
-
-def _check_harmonics(harmonics: IntArray, samples_per_period: int) -> None:
-    if harmonics.ndim != 1 or harmonics.size == 0:
-        raise ValueError(f"harmonics: shape {harmonics.shape}, expected (F,) with F >= 1")
-    last = (samples_per_period - 1) // 2
-    if harmonics[0] < 1 or harmonics[-1] > last or np.any(np.diff(harmonics) < 1):
-        raise ValueError(
-            f"harmonics: {harmonics[0]}..{harmonics[-1]}, expected ascending, from 1 to {last}"
-        )

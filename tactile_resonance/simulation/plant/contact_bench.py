@@ -54,38 +54,22 @@ class VirtualBench(OfRosTime):
     Parameters
     ----------
     plant : Plant
-    start : Pose
-        Of the tip at time 0.
-    tracking : TrackingParameters
-    period_s : float
-        Of the robot [s].
-    seed : int
+    motion : TipMotion
+        Of the robot, at its start.
 
     Attributes
     ----------
     time_ns : int
-    motion : TipMotion
     on_step : list of callables
         Called after every period: recorders, and faults at their time.
     """
 
-    def __init__(
-        self,
-        plant: Plant,
-        start: Pose,
-        *,
-        tracking: TrackingParameters | None = None,
-        period_s: float = 0.002,
-        seed: int = 0,
-    ) -> None:
-        self.plant = plant
+    def __init__(self, plant: Plant, motion: TipMotion) -> None:
+        self.plant, self.motion = plant, motion
         self.time_ns = 0
-        self.motion = TipMotion(
-            tracking or TrackingParameters(), start, period_s=period_s, seed=seed
-        )
         self.on_step: list[Callable[[], None]] = []
-        self._period_ns = round(1e9 * period_s)
-        plant.step(transform_from_pose(start.vector), period_s)
+        self._period_ns = round(1e9 * motion.period_s)
+        plant.step(transform_from_pose(motion.pose.vector), motion.period_s)
 
     def now_ns(self) -> int:
         """Virtual time since the start [ns]."""
@@ -363,9 +347,8 @@ class ContactBench:
             tip_radius_m=tip.radius_m,
             mounting=mounting,
         )
-        self.clock = VirtualBench(
-            self.plant, start, tracking=tracking, period_s=period_s, seed=seed
-        )
+        motion = TipMotion(tracking or TrackingParameters(), start, period_s=period_s, seed=seed)
+        self.clock = VirtualBench(self.plant, motion)
         self.arm = VirtualArm(self.clock)
         self.cell = VirtualCell(self.clock, cell_parameters, seed=seed)
         payload = Payload(tool_kg, vector(centre)) if on_tool else None

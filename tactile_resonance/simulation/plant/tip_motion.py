@@ -40,7 +40,7 @@ class TipMotion:
         self._wanted: FloatArray = np.zeros(6)
         self._acceleration_m_s2 = 1.0
         self._lag = Lag(parameters, [0.0] * 6, period_s)
-        self._jitter = Jitter(parameters, period_s, seed) if parameters.jitter_rms_m > 0 else None
+        self._jitter = Jitter(parameters, period_s, seed)
 
     def speed(self, twist: Sequence[float] | FloatArray, acceleration_m_s2: float) -> None:
         """Go over to a twist (6,) in the base, under an acceleration limit, and keep it."""
@@ -53,10 +53,8 @@ class TipMotion:
         last = self.twist
         self.twist = np.array(self._lag.step(self._set_twist.tolist()))
         self.reported = moved(self.reported, (last + self.twist) / 2 * dt)
-        self.pose = self.reported
-        if self._jitter is not None:
-            place = self.reported.position_m + self._jitter.step()
-            self.pose = Pose(place, self.reported.rotation_rad)
+        place = self.reported.position_m + self._jitter.step()
+        self.pose = Pose(place, self.reported.rotation_rad)
 
     def _limited(self, wanted: FloatArray) -> FloatArray:
         change = wanted - self._set_twist

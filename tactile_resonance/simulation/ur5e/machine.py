@@ -63,7 +63,7 @@ class Joints:
 
     def __init__(self, q: Six, tracking: TrackingParameters, seed: Seed) -> None:
         self._tracking = tracking
-        self._jitter = Jitter(tracking, CYCLE_S, seed) if tracking.jitter_rms_m > 0 else None
+        self._jitter = Jitter(tracking, CYCLE_S, seed)
         self.posture = Posture(q)
         self.tremble_m: Vector = ORIGIN
         self.hold()
@@ -80,8 +80,7 @@ class Joints:
 
     def reseed(self, seed: Seed) -> None:
         """Let vibration follow from a seed, from the next step on."""
-        if self._jitter is not None:
-            self._jitter.reseed(seed)
+        self._jitter.reseed(seed)
 
     def step(self, target_q: Six, powered: bool) -> None:
         """Follow for one cycle; without power the brakes hold the joints where they are."""
@@ -93,8 +92,7 @@ class Joints:
         if q != before:
             self.posture = Posture(q)
         self.qd = ZERO if q == before else rate(before, q)
-        if self._jitter is not None:
-            self.tremble_m = self._jitter.step()
+        self.tremble_m = self._jitter.step()
 
     def hold(self) -> Six:
         """Forget what is pending and return the angles at which the brakes caught the joints."""
