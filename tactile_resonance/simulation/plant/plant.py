@@ -64,25 +64,11 @@ class CellMounting:
         require(good, "carried_kg", self.carried_kg, "a mass, 0 or above")
 
 
-@dataclass(frozen=True)
-class Friction:
-    """Contact along the surface.
+POISSON_RATIO = 0.49
+"""Of what is touched, where the contact slips; see `SLIP`."""
 
-    Attributes
-    ----------
-    coefficient : float
-        Of Coulomb friction; 0.1 is chosen for a wet plastic ball, not measured.
-    poisson_ratio : float
-        Tangential over normal stiffness is ``2 (1 - nu) / (2 - nu)`` (Mindlin 1949).
-    """
-
-    coefficient: float = 0.1
-    poisson_ratio: float = 0.49
-
-    @property
-    def stiffness_ratio(self) -> float:
-        """Tangential over normal stiffness of the contact before it slips."""
-        return 2 * (1 - self.poisson_ratio) / (2 - self.poisson_ratio)
+SLIP = 2 * (1 - POISSON_RATIO) / (2 - POISSON_RATIO)
+"""Tangential over normal stiffness of the contact before it slips (Mindlin 1949)."""
 
 
 class Plant:
@@ -99,7 +85,8 @@ class Plant:
         From a tissue to a `TipOnTissue` at rest on it; its ball is that of `relative_radius_m`.
     tip_radius_m : float
     mounting : CellMounting
-    friction : Friction
+    friction : float
+        Coefficient of Coulomb friction; 0.1 is chosen for a wet plastic ball, not measured.
 
     Attributes
     ----------
@@ -136,7 +123,7 @@ class Plant:
         *,
         tip_radius_m: float,
         mounting: CellMounting | None = None,
-        friction: Friction | None = None,
+        friction: float = 0.1,
     ) -> None:
         require(0 < tip_radius_m < math.inf, "tip_radius_m", tip_radius_m, "a number above 0")
         self.surface = surface
@@ -144,7 +131,7 @@ class Plant:
         self.tissue_at = tissue_at
         self.tip_radius_m = tip_radius_m
         self.mounting = CellMounting() if mounting is None else mounting
-        self.friction = Friction() if friction is None else friction
+        self.friction = friction
         self.time_s = 0.0
         self.force_n = self.torque_nm = ORIGIN
         self.depth_m = self.contact_radius_m = 0.0
@@ -269,8 +256,8 @@ class Plant:
             return ORIGIN
         (x, y, z), (dx, dy, dz) = self._slip, way
         x, y, z = beside((x + dx, y + dy, z + dz), normal)
-        stiffness = self.friction.stiffness_ratio * 1.5 * pushed / self.depth_m
-        length, most = math.hypot(x, y, z), self.friction.coefficient * pushed / stiffness
+        stiffness = SLIP * 1.5 * pushed / self.depth_m
+        length, most = math.hypot(x, y, z), self.friction * pushed / stiffness
         if length > most:
             share = most / length
             x, y, z = x * share, y * share, z * share

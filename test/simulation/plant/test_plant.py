@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.simulation.plant.plant import CellMounting, Friction, Plant
+from tactile_resonance.simulation.plant.plant import CellMounting, Plant
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, RoundSurface, relative_radius_m
 from tactile_resonance.simulation.plant.tip import RigidTip, SprungIndenter, Tip
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -51,7 +51,7 @@ def test_force_of_a_pressed_ball_is_that_of_hertz_along_the_normal():
 
 def test_tilted_surface_pushes_along_its_normal_and_slides_with_friction():
     tilt = np.deg2rad(10)
-    p = plant(surface=FlatSurface.tilted(0.0, tilt, 0.0), friction=Friction(coefficient=0.0))
+    p = plant(surface=FlatSurface.tilted(0.0, tilt, 0.0), friction=0.0)
     normal = np.array([np.sin(tilt), 0, np.cos(tilt)])
     for depth in np.linspace(-1e-4, 4e-4, 26):
         p.step(at(*(normal * RADIUS_M - [0, 0, depth])), 0.002)
@@ -67,7 +67,7 @@ CENTRE_M, CURVED_M = np.array([0.01, -0.02, 0.05]), 10e-3
 def test_sphere_pushes_along_its_own_normal_with_the_force_of_two_curved_bodies(hollow, polar_rad):
     surface = RoundSurface(CENTRE_M, CURVED_M, hollow)
     tip = Tip(RADIUS_M, poisson_ratio=NU)
-    p = plant(surface=surface, tip=lambda t: tip.on(t, surface), friction=Friction(coefficient=0.0))
+    p = plant(surface=surface, tip=lambda t: tip.on(t, surface), friction=0.0)
     # from the centre to the contact; the tissue is inside of the sphere, or outside of the hollow
     out = np.array([np.sin(polar_rad), 0, np.cos(polar_rad)]) * (-1 if hollow else 1)
     normal = -out if hollow else out
@@ -94,7 +94,7 @@ def test_sphere_without_bounds_is_a_plane_and_a_ball_must_fit_into_its_hollow():
 
 
 def test_friction_sticks_below_its_limit_and_slides_at_it():
-    p = plant(friction=Friction(coefficient=0.3, poisson_ratio=NU))
+    p = plant(friction=0.3)
     p.step(at(0, 0, RADIUS_M), 0.002)
     p.step(at(0, 0, RADIUS_M - 4e-4), 0.002)
     normal = hertz(4e-4)
