@@ -355,7 +355,8 @@ def design_multisine(
         label=label,
         bands=bands,
     )
-    return scaled_to(unscaled, level_v, scale_by)
+    present_v = unscaled.level_v if scale_by == "rms" else float(np.max(np.abs(unscaled.period())))
+    return replace(unscaled, amplitude_v=shape * (level_v / present_v))
 
 
 def sweep_phases(harmonics: IntArray, amplitude: FloatArray) -> FloatArray:
@@ -386,14 +387,6 @@ def _stretches(band_hz: Any, most_hz: float) -> list[tuple[float, float]]:
     accepted = f"(low, high) in Hz with 0 < low <= high < {most_hz:g}, or several of them"
     require(good, "band_hz", band_hz, accepted)
     return ends
-
-
-def scaled_to(excitation: Excitation, level_v: float, scale_by: str) -> Excitation:
-    """The same signal with the given root mean square or peak [V]."""
-    present = excitation.level_v
-    if scale_by == "peak":
-        present = float(np.max(np.abs(excitation.period())))
-    return replace(excitation, amplitude_v=excitation.amplitude_v * (level_v / present))
 
 
 def _check_period(sample_rate_hz: float, samples_per_period: int) -> None:

@@ -108,7 +108,9 @@ def _flatten(prefix: str, value: Any, content: Fields) -> None:
             content[name] = item
             if item.dtype.kind == "i":
                 content[name + _DTYPE] = np.array(item.dtype.str)
-                content[name] = item.astype(_smallest(item))
+                # -1 - n needs as many bits as n
+                low, high = int(item.min(initial=0)), int(item.max(initial=0))
+                content[name] = item.astype(np.min_scalar_type(min(low, -1 - high)))
             elif item.dtype.kind != "f":
                 raise ValueError(f"{name}: values of type {item.dtype}, expected int or float")
         elif isinstance(item, Enum):
@@ -145,11 +147,3 @@ def _unflatten(prefix: str, kind: type, content: Mapping[str, npt.NDArray[Any]])
             is_tuple = str(field.type).startswith("tuple")
             values[field.name] = tuple(array.tolist()) if is_tuple else array
     return kind(**values)
-
-
-def _smallest(values: npt.NDArray[np.signedinteger]) -> type[np.signedinteger]:
-    low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
-    for dtype in (np.int8, np.int16, np.int32):
-        if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max:
-            return dtype
-    return np.int64
