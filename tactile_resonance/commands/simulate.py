@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from tactile_resonance.commands.options import add_file
+from tactile_resonance.contact.vectors import six
 from tactile_resonance.fields import number, require
 from tactile_resonance.processes import take_priority
 from tactile_resonance.simulation.cell.load_cell import LoadCell
@@ -136,7 +137,7 @@ def _simulate_ur(options: argparse.Namespace) -> int:
     nothing = options.tissue is None and options.scene is None
     tabletop = None if nothing else _tabletop(options)
     controller = UrController(
-        MachineConfig(tip_in_flange=TIP_IN_FLANGE.vector),
+        MachineConfig(tip_in_flange=six(TIP_IN_FLANGE.vector)),
         None if tabletop is None else tabletop.plant,
         seed=options.seed,
     )

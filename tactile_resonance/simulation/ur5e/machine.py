@@ -13,7 +13,6 @@ from typing import Protocol
 
 import numpy as np
 
-from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import NO_TURN, Vector, cross, dot, rotated_back
 from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.ur5e.forces import (
@@ -132,9 +131,9 @@ class MachineConfig:
 
     Attributes
     ----------
-    start_q : (6,) array
+    start_q : 6 floats
         Joint angles at power-up [rad].
-    tip_in_flange : (6,) array
+    tip_in_flange : 6 floats
         True pose of the tip in the flange; the program does not know it unless it sets its TCP so.
     tool : ToolPayload
         True mass on the flange; the controller compensates the payload that the program sets.
@@ -147,10 +146,8 @@ class MachineConfig:
         published; this is the model's.
     """
 
-    start_q: FloatArray = field(
-        default_factory=lambda: np.array([0.0, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0])
-    )
-    tip_in_flange: FloatArray = field(default_factory=lambda: np.zeros(6))
+    start_q: Six = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
+    tip_in_flange: Six = ZERO
     tool: ToolPayload = field(default_factory=ToolPayload)
     limits: MotionLimits = field(default_factory=MotionLimits)
     tracking: TrackingParameters = field(default_factory=TrackingParameters)
@@ -185,9 +182,8 @@ class Machine:
     ) -> None:
         self.config = config
         self.environment = environment
-        start_q = tuple(config.start_q.tolist())
-        self.target = Target(start_q, config.limits)
-        self.joints = Joints(start_q, config.tracking, int(random.integers(2**31)))
+        self.target = Target(config.start_q, config.limits)
+        self.joints = Joints(config.start_q, config.tracking, int(random.integers(2**31)))
         self.sensor = FtSensor(config.ft, random)
         self.force_mode = ForceMode(self.target)
         self.payload = config.tool
