@@ -124,10 +124,6 @@ WINDOW = 512  # fine samples per window: short, so that the iteration contracts 
 TOLERANCE, MOST_ITERATIONS = 1e-13, 100
 
 
-class DriveTooStrongError(ValueError):
-    """No response of the nonlinear sensor to this drive was found; it may well have none."""
-
-
 def effective_drive(
     lines: Lines, nonlinear: NonlinearParameters, oversampling: int = OVERSAMPLING
 ) -> Lines:
@@ -156,7 +152,7 @@ def solve_strain(
 
     Raises
     ------
-    DriveTooStrongError
+    ValueError
         If it does not converge: its loop gain, about ``3 g3 s^2 |S|`` at resonance, exceeds 1, as for a
         narrow-band drive of 4 V rms.
     """
@@ -174,7 +170,7 @@ def solve_strain(
                 break
     rms_v = np.linalg.norm(lines.phasor_v) / np.sqrt(2)
     count, highest_hz = lines.harmonics.size, lines.frequency_hz[-1]
-    raise DriveTooStrongError(
+    raise ValueError(
         f"amplitude_v: got {rms_v:.3g} V rms on {count} lines up to {highest_hz:g} Hz; accepted is a drive "
         "weak enough for the sensor's nonlinearity (its response grows beyond bounds); lower the level or "
         "spread it over more lines"
@@ -202,7 +198,7 @@ def nonlinear_steady_state(
 
     Raises
     ------
-    DriveTooStrongError
+    ValueError
         As `solve_strain`.
     """
     drive = effective_drive(lines, nonlinear, oversampling)
@@ -262,7 +258,7 @@ class NonlinearStream:
 
         Raises
         ------
-        DriveTooStrongError
+        ValueError
             If the response grows beyond bounds.
         """
         through = self._through.play(lines)

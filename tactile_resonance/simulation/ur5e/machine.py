@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from tactile_resonance.contact.vectors import NO_TURN, Vector, cross, dot, rotated_back
+from tactile_resonance.contact.vectors import Vector, dot, rotated_back
 from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
@@ -31,11 +31,11 @@ from tactile_resonance.simulation.ur5e.poses import (
     Transform,
     difference,
     largest,
-    moved_wrench,
     pose_from_transform,
     rounded,
     total,
     transform_from_pose,
+    wrench_about_origin,
 )
 from tactile_resonance.simulation.ur5e.target import (
     CYCLE_S,
@@ -322,7 +322,8 @@ class Machine:
         if self.external is not None:
             own, place_m = self.external
             weight = difference(weight, own.weight(turn, self.gravity_m_s2))
-            measured = moved_wrench(self.external_wrench, (NO_TURN, place_m))
+            fx, fy, fz, tx, ty, tz = self.external_wrench
+            measured = wrench_about_origin(place_m, (fx, fy, fz), (tx, ty, tz))
         self.sensor.step(wrench, weight, measured)
         self.tcp_force = self.sensor.at_tcp(turn, self.target.tcp[1])
         self._history.append((self.posture.q, self.tcp_force))
@@ -336,6 +337,4 @@ class Machine:
             return ZERO
         flange = self.posture.flange[0]
         force = rotated_back(flange, environment.force_n)
-        tx, ty, tz = rotated_back(flange, environment.torque_nm)
-        mx, my, mz = cross(self._tip[1], force)
-        return *force, tx + mx, ty + my, tz + mz
+        return wrench_about_origin(self._tip[1], force, rotated_back(flange, environment.torque_nm))

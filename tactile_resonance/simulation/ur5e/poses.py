@@ -15,7 +15,6 @@ from tactile_resonance.contact.vectors import (
     Vector,
     cross,
     dot,
-    rotated,
     rotated_back,
     transposed,
     turn_from_vector,
@@ -111,14 +110,7 @@ def turn_between(start: Transform, end: Transform) -> Vector:
     return vector_from_turn(turn_product(end[0], transposed(start[0])))
 
 
-def moved_wrench(wrench: Six, to_frame: Transform) -> Six:
-    """Return a wrench [N, N m] expressed at and in the frame that `to_frame` leads to.
-
-    `to_frame` holds the frame in which the wrench is given, seen from the frame wanted.
-    """
-    turn, arm = to_frame
-    fx, fy, fz, tx, ty, tz = wrench
-    force = rotated(turn, (fx, fy, fz))
-    x, y, z = rotated(turn, (tx, ty, tz))
-    dx, dy, dz = cross(arm, force)
-    return *force, x + dx, y + dy, z + dz
+def wrench_about_origin(place_m: Vector, force: Vector, torque: Vector) -> Six:
+    """Return as a wrench about the origin what acts at a place: a force [N] and a torque [N m]."""
+    x, y, z = cross(place_m, force)
+    return *force, torque[0] + x, torque[1] + y, torque[2] + z
