@@ -148,10 +148,7 @@ def make_recording(
             _cut(x, segments, name) for x, name in zip(channels, (u_name, y_name), strict=False)
         ]
     n = _period_length(channels[0].shape, samples_per_period, periods, u_name)
-    channels = [
-        x.reshape((1,) * (3 - x.ndim) + x.shape) for x in channels
-    ]  # (M, P, N) or (M, 1, n)
-    channels = [x.reshape(x.shape[0], -1, n) for x in channels]
+    channels = [x.reshape(x.shape[0] if x.ndim == 3 else 1, -1, n) for x in channels]  # (M, P, N)
     if periods is not None:
         if periods > channels[0].shape[1]:
             raise ValueError(

@@ -20,6 +20,7 @@ from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import GRAVITY_M_S2
 from tactile_resonance.contact.vectors import (
     Vector,
+    added,
     cross,
     difference,
     rotated,
@@ -194,7 +195,8 @@ class Plant:
             radius = -self.tip_radius_m
             self.torque_nm = cross((radius * nx, radius * ny, radius * nz), (x, y, z))
         if self.mounting.mount is Mount.TOOL:
-            self._places = [*self._places[-2:], self._on_tip(self._carried_m)]
+            carried = added(place, rotated(self._turn, self._carried_m))
+            self._places = [*self._places[-2:], carried]
 
     def wrench_at_cell(self) -> tuple[Vector, Vector]:
         """Force [N] and torque [N m] on the cell about its origin, in its frame, without noise.
@@ -272,8 +274,3 @@ class Plant:
         (x, y, z), (lx, ly, lz) = difference(third, second), difference(second, first)
         square = self._period_s**2
         return (x - lx) / square, (y - ly) / square, (z - lz) / square
-
-    def _on_tip(self, place_m: Vector) -> Vector:
-        """What has a place in the frame `tip`, in the base."""
-        (x, y, z), (dx, dy, dz) = self.tip_m, rotated(self._turn, place_m)
-        return x + dx, y + dy, z + dz

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 
 from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.simulation.ur5e.poses import Transform, transform_from_pose
@@ -23,7 +22,6 @@ DOUBLE_INPUTS = tuple(f"input_double_register_{n}" for n in range(REGISTER_COUNT
 _REGISTERS = frozenset({*INT_INPUTS, *DOUBLE_INPUTS})
 
 
-@dataclass
 class Registers:
     """Registers of a controller.
 
@@ -37,15 +35,12 @@ class Registers:
         Names of inputs written since the last cycle, with whatever value: what a watchdog watches.
     """
 
-    inputs: dict[str, float] = field(
-        default_factory=lambda: {
-            **dict.fromkeys(INT_INPUTS, 0),
-            **dict.fromkeys(DOUBLE_INPUTS, 0.0),
-        }
-    )
-    output_int: list[int] = field(default_factory=lambda: [0] * REGISTER_COUNT)
-    output_double: list[float] = field(default_factory=lambda: [0.0] * REGISTER_COUNT)
-    refreshed: set[str] = field(default_factory=set)
+    def __init__(self) -> None:
+        self.inputs: dict[str, float] = dict.fromkeys(INT_INPUTS, 0)
+        self.inputs.update(dict.fromkeys(DOUBLE_INPUTS, 0.0))
+        self.output_int = [0] * REGISTER_COUNT
+        self.output_double = [0.0] * REGISTER_COUNT
+        self.refreshed: set[str] = set()
 
 
 # Types of all inputs, as the RTDE guide names them.
