@@ -99,7 +99,7 @@ class LoadCell:
             self._counts, self._bits = self._transducer.convert(load, before, part)
             self._ticks += 1
             if self.streaming and self._ticks % self._decimation == 0:
-                frames += self._wrench_frames(START, self._time_s)
+                frames += self._wrench_frames(START)
         if load != before:
             # what is left of the span counts for the next call
             left = (time_s - self._time_s) / span_s if span_s > 0 else 0.0
@@ -125,7 +125,7 @@ class LoadCell:
             self._transducer.set_zero(bool(parameters[0]))
             return []
         if command == READ_ONCE:
-            return self._wrench_frames(READ_ONCE, self._time_s or 0.0)
+            return self._wrench_frames(READ_ONCE)
         return self._frames(bytes([command, *self._answer(command, parameters)]))
 
     def _answer(self, command: int, parameters: list[int]) -> bytes:
@@ -161,19 +161,18 @@ class LoadCell:
             return bytes(min(255, count) for count in self._transducer.overload_counts)
         return bytes([0, UNSUPPORTED])
 
-    def _wrench_frames(self, command: int, time_s: float) -> list[CanFrame]:
+    def _wrench_frames(self, command: int) -> list[CanFrame]:
         if self.faults.silent:
             return []
         self._sent += 1
-        frames = self._frames(struct.pack(">B6hB", command, *self._counts, self._bits), time_s)
+        frames = self._frames(struct.pack(">B6hB", command, *self._counts, self._bits))
         every = self.faults.lose_second_every
         return frames[:1] if every and self._sent % every == 0 else frames
 
-    def _frames(self, response: bytes, time_s: float | None = None) -> list[CanFrame]:
+    def _frames(self, response: bytes) -> list[CanFrame]:
         whole = response.ljust(16, b"\0")
-        at = self._time_s or 0.0 if time_s is None else time_s
-        first, second = RESPONSE_IDS
-        return [CanFrame(at, first, whole[:8]), CanFrame(at, second, whole[8:])]
+        parts = zip(RESPONSE_IDS, (whole[:8], whole[8:]), strict=True)
+        return [CanFrame(self._time_s or 0.0, can_id, part) for can_id, part in parts]
 
 
 def _decimation(rate_code: int) -> int:

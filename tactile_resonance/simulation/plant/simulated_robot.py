@@ -197,12 +197,12 @@ class SimulatedRobot:
             "state": self._state,
             "freeze": self._freeze,
             "drop": lambda _: {"dropped": rtde.drop()},
-            "protective_stop": _plain(controller.protective_stop),
-            "emergency_stop": _plain(controller.emergency_stop),
-            "release_emergency_stop": _plain(controller.safety.release_emergency_stop),
-            "remote_control": _switch(controller, "remote_control"),
-            "script_starts": _switch(controller, "script_starts"),
-            "registers_in_use": _switch(rtde, "registers_in_use"),
+            "protective_stop": partial(_plain, controller.protective_stop),
+            "emergency_stop": partial(_plain, controller.emergency_stop),
+            "release_emergency_stop": partial(_plain, controller.safety.release_emergency_stop),
+            "remote_control": partial(_switch, controller, "remote_control"),
+            "script_starts": partial(_switch, controller, "script_starts"),
+            "registers_in_use": partial(_switch, rtde, "registers_in_use"),
             "log": lambda _: {"log": list(controller.log)},
         }
 
@@ -238,24 +238,16 @@ class SimulatedRobot:
         return {}
 
 
-def _plain(action: Callable[[], None]) -> Callable[[dict], dict]:
+def _plain(action: Callable[[], None], _: dict) -> dict:
     """An order without fields and without an answer."""
-
-    def order(_: dict) -> dict:
-        action()
-        return {}
-
-    return order
+    action()
+    return {}
 
 
-def _switch(target: Any, name: str) -> Callable[[dict], dict]:
+def _switch(target: Any, name: str, fields: dict) -> dict:
     """An order that sets an attribute to its field ``value``."""
-
-    def order(fields: dict) -> dict:
-        value = fields.get("value")
-        if not isinstance(value, bool):
-            raise ValueError(f"value: {value!r}, expected true or false")
-        setattr(target, name, value)
-        return {}
-
-    return order
+    value = fields.get("value")
+    if not isinstance(value, bool):
+        raise ValueError(f"value: {value!r}, expected true or false")
+    setattr(target, name, value)
+    return {}
