@@ -47,13 +47,11 @@ Progress = Callable[[str], None]
 def records_at_levels(
     levels_v: Iterable[float],
     *,
-    gelatine_percent: float = 10.0,
     realisations: int = 4,
     periods: int = 3,
-    seed: int = 1,
     progress: Progress = lambda text: None,
 ) -> dict[float, tuple[FloatArray, FloatArray, IntArray, float]]:
-    """Records of an odd random multisine at several drive levels, nonlinearity switched on.
+    """Records of an odd random multisine at several drive levels on 10 % gelatine, nonlinearity switched on.
 
     Returns
     -------
@@ -61,7 +59,7 @@ def records_at_levels(
         Per level [V rms]: actuator and sensor (M, P, N) [V], excited harmonics, sample rate [Hz].
     """
     bench = SimulatedBench.from_configuration()
-    tissue = read_tissues().gelatine(gelatine_percent)
+    tissue = read_tissues().gelatine(10.0)
     records = {}
     for level_v in levels_v:
         channels = []
@@ -70,11 +68,11 @@ def records_at_levels(
             excitation = design_multisine(
                 grid=Grid.ODD_RANDOM,
                 level_v=level_v,
-                seed=seed,
+                seed=1,
                 realisation=m,
                 realisations=realisations,
             )
-            run = bench.start(tissue, seed=seed + m, effects=BenchEffects(nonlinearity=True))
+            run = bench.start(tissue, seed=1 + m, effects=BenchEffects(nonlinearity=True))
             block = run.block(excitation, periods)
             channels.append([block.actuator.volts(), block.sensor.volts()])
         u, y = np.moveaxis(np.array(channels), 1, 0).reshape(2, realisations, periods, -1)
@@ -88,11 +86,10 @@ def repeated_records(
     positions: int = 4,
     repetitions: int = 4,
     periods: int = 4,
-    gelatine_percent: float = 12.0,
     seed: int = 1,
     progress: Progress = lambda text: None,
 ) -> tuple[FloatArray, FloatArray, IntArray, float]:
-    """Records of the same excitation on several preparations, positions and repetitions.
+    """Records of the same excitation on several preparations of 12 % gelatine, positions and repetitions.
 
     Returns
     -------
@@ -108,7 +105,7 @@ def repeated_records(
     n = excitation.samples_per_period
     u, y = np.empty((2, preparations, positions, repetitions, periods, n))
     for i in range(preparations):
-        casting = gelatine_percent + PREPARATION_PERCENT * rng.standard_normal()
+        casting = 12.0 + PREPARATION_PERCENT * rng.standard_normal()
         for j in range(positions):
             progress(f"preparation {i + 1} of {preparations}, position {j + 1} of {positions}")
             tissue = library.gelatine(casting + POSITION_PERCENT * rng.standard_normal())
