@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,44 +19,27 @@ from tactile_resonance.analysis import (
     analyse,
     analysis_as_json,
 )
-from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
+from tactile_resonance.calibration.file import read_calibration
 from tactile_resonance.calibration.validity import as_of_today
 from tactile_resonance.commands.options import add_band, add_figure, add_file, add_output
 from tactile_resonance.contact_analysis import ContactAnalysis, contact_content, estimate_contact
 from tactile_resonance.fields import band, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.frf.estimate import METHODS
-from tactile_resonance.front import read_record, read_run
+from tactile_resonance.front import FIELDS, read_record, read_run
 from tactile_resonance.poles.estimator import CANDIDATES
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, ModelStructure
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.silent import check_undriven, silent_record
 
-MOST_HARMONICS = 10**7
+if TYPE_CHECKING:
+    from tactile_resonance.scan.run_content import RunContent
 
-OPTIONS = {
-    "measurement_id": "--measurement",
-    "point": "--point",
-    "u": "--u",
-    "y": "--y",
-    "sample_rate_hz": "--sample-rate",
-    "samples_per_period": "--samples-per-period",
-    "periods": "--periods",
-    "segments": "--segments",
-    "excited_harmonics": "--harmonics",
-    "band_hz": "--band",
-    "order": "--order",
-    "numerator_order": "--numerator-order",
-    "poles_method": "--method",
-    "channel_delay_s": "--channel-delay",
-    "force_n": "--force",
-    "relaxed_ratio": "--relaxed-ratio",
-}
-"""Fields of the library, as its messages begin with them, that an option gives."""
+MOST_HARMONICS = 10**7
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Options of the command."""
+    """Options of the command, named inside as the fields of the library that they give."""
     parser = commands.add_parser(
         "analyze",
         help="FRF and poles of a recorded measurement",
@@ -66,7 +51,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help=".npz, .mat or .csv file, or a folder: records of the nodes, a scan's run",
     )
     parser.add_argument(
-        "--measurement", type=int, metavar="ID", help="which one of a folder with several"
+        "--measurement",
+        dest="measurement_id",
+        type=int,
+        metavar="ID",
+        help="which one of a folder with several",
     )
     parser.add_argument(
         "--point",
@@ -76,7 +65,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--u", metavar="FIELD", help="actuator field (default: u)")
     parser.add_argument("--y", metavar="FIELD", help="sensor field (default: y)")
-    parser.add_argument("--sample-rate", type=float, metavar="HZ", help="wins over the file's")
+    parser.add_argument(
+        "--sample-rate",
+        dest="sample_rate_hz",
+        type=float,
+        metavar="HZ",
+        help="wins over the file's",
+    )
     parser.add_argument("--samples-per-period", type=int, metavar="N", help="wins over the file's")
     parser.add_argument(
         "--periods",
@@ -93,6 +88,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         "--harmonics",
+        dest="excited_harmonics",
         type=parse_harmonics,
         metavar="H,FIRST:LAST:STEP,...",
         help="excited multiples of the sample rate over the samples per period, LAST included; "
@@ -119,6 +115,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         "--method",
+        dest="poles_method",
         choices=POLES_METHODS,
         default="auto",
         help="poles from all bins together with the transients (joint) or from the FRF (default: "
@@ -126,12 +123,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         "--frf",
+        dest="frf_method",
         choices=METHODS,
         default=METHODS[0],
         help=f"how transients are dealt with (default: {METHODS[0]})",
     )
     parser.add_argument(
         "--channel-delay",
+        dest="channel_delay_s",
         type=float,
         default=0.0,
         metavar="S",
@@ -155,6 +154,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         "--force",
+        dest="force_n",
         type=float,
         metavar="N",
         help="of the contact, with --calibration (default: a run's own; else unknown)",
@@ -172,7 +172,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     add_output(parser, "--json", "write the result here")
     add_figure(parser, "--plot", "draw it here")
-    parser.set_defaults(run=run)
+    option_of = {each.dest: each.option_strings[0] for each in parser._actions if each.option_strings}
+    parser.set_defaults(run=run, option_of=option_of)
 
 
 def parse_order(text: str) -> int:
@@ -220,31 +221,31 @@ def run(options: argparse.Namespace) -> int:
         return _run(options)
     except ValueError as error:
         field, colon, rest = str(error).partition(":")
-        if not colon or field not in OPTIONS:
+        if not colon or field not in options.option_of:
             raise
-        raise ValueError(f"{field} ({OPTIONS[field]}):{rest}") from error
+        raise ValueError(f"{field} ({options.option_of[field]}):{rest}") from error
 
 
 def _run(options: argparse.Namespace) -> int:
     """Nothing is written unless all went well."""
     _check_outputs(options)
     if options.point is not None:
-        if options.measurement is not None:
+        if options.measurement_id is not None:
             raise ValueError("point: given beside --measurement, expected one of them")
         if not options.record.is_dir():
             raise ValueError(f"point: {options.point}, only for a run; {options.record} is no folder")
         from tactile_resonance.scan.recorded import measurement_at
 
-        options.measurement = measurement_at(options.record, options.point)
+        options.measurement_id = measurement_at(options.record, options.point)
     if options.calibration is not None:
         return _analyze_contacts(options)
-    for name in ("force", "from_rest", "relaxed_ratio"):
-        given = getattr(options, name) not in (None, False)
-        option = f"--{name.replace('_', '-')}"
-        require(not given, option, getattr(options, name), "one beside --calibration")
-    recording = _recording(options)
+    for name in ("force_n", "from_rest", "relaxed_ratio"):
+        value = getattr(options, name)
+        good = value in (None, False)
+        require(good, options.option_of[name], value, "one beside --calibration")
+    recording = _recording(options, options.measurement_id)
     rate_hz = recording.sample_rate_hz
-    band_hz = None if options.band is None else band(options.band, most_hz=rate_hz / 2)
+    band_hz = None if options.band_hz is None else band(options.band_hz, most_hz=rate_hz / 2)
     if options.silent:
         for name in ("json", "plot"):
             if getattr(options, name) is not None:
@@ -275,10 +276,10 @@ def _run(options: argparse.Namespace) -> int:
         band_hz=band_hz,
         structure=structures[0],
         candidates=structures[1:] and structures,
-        frf_method=options.frf,
-        poles_method=options.method,
+        frf_method=options.frf_method,
+        poles_method=options.poles_method,
         with_distortion=options.distortion,
-        channel_delay_s=options.channel_delay,
+        channel_delay_s=options.channel_delay_s,
     )
     outputs: dict[Path, bytes] = {}
     if options.json:
@@ -303,18 +304,9 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _recording(options: argparse.Namespace, measurement_id: int | None = None) -> Recording:
-    return read_record(
-        options.record,
-        options.measurement if measurement_id is None else measurement_id,
-        u=options.u,
-        y=options.y,
-        sample_rate_hz=options.sample_rate,
-        samples_per_period=options.samples_per_period,
-        periods=options.periods,
-        segments=options.segments,
-        excited_harmonics=options.harmonics,
-    )
+def _recording(options: argparse.Namespace, measurement_id: int | None) -> Recording:
+    fields = {name: getattr(options, name) for name in (*FIELDS, "periods")}
+    return read_record(options.record, measurement_id, **fields)
 
 
 def as_text(analysis: Analysis) -> str:
@@ -364,16 +356,21 @@ def _analyze_contacts(options: argparse.Namespace) -> int:
         if getattr(options, name):
             raise ValueError(f"--{name}: not with --calibration")
     sensor = read_calibration(options.calibration)
-    if (options.record / "run.json").is_file():
-        sensor = _as_of_run(options.record, sensor)
+    run = read_run(options.record) if (options.record / "run.json").is_file() else None
+    if run is not None:
+        from tactile_resonance.scan.references import calibration_in_air
+
+        in_air = calibration_in_air(run, sensor.calibration)
+        print(f"sensor in air: {in_air.message}")
+        sensor = replace(sensor, calibration=as_of_today(sensor.calibration, in_air))
     contents = {}
-    for key, label, (force_n, force_std_n) in _pressed(options):
+    for key, label, force_n, force_std_n in _pressed(options, run):
         found = estimate_contact(
             _recording(options, key),
             sensor,
-            band_hz=options.band,
-            force_n=force_n if options.force is None else options.force,
-            force_std_n=force_std_n if options.force is None else 0.0,
+            band_hz=options.band_hz,
+            force_n=force_n,
+            force_std_n=force_std_n,
             from_rest=options.from_rest,
             relaxed_ratio=1.0 if options.relaxed_ratio is None else options.relaxed_ratio,
         )
@@ -386,37 +383,22 @@ def _analyze_contacts(options: argparse.Namespace) -> int:
     return 0
 
 
-def _as_of_run(run: Path, sensor: CalibratedSensor) -> CalibratedSensor:
-    """The sensor as the run found it in air, which is printed."""
-    content = read_run(run)
-    from tactile_resonance.scan.references import calibration_in_air
-
-    found = calibration_in_air(content, sensor.calibration)
-    print(f"sensor in air: {found.message}")
-    return replace(sensor, calibration=as_of_today(sensor.calibration, found))
-
-
 def _pressed(
-    options: argparse.Namespace,
-) -> list[tuple[int | None, str, tuple[float, float]]]:
+    options: argparse.Namespace, run: RunContent | None
+) -> Iterator[tuple[int | None, str, float, float]]:
     """Measurement, name, force and its deviation [N] of each record that is asked for."""
-    unknown = (float("nan"), 0.0)
-    if not (options.record / "run.json").is_file():
-        return [(options.measurement, "", unknown)]
-    wanted = options.measurement
-    points = [
-        (of.measurement_id, f"point {of.index} {of.label}".strip(), (of.force_n, of.force_std_n))
-        for of in read_run(options.record).results
-        if of.blocks and wanted in (None, of.measurement_id)
-    ]
-    points = [
-        (key, label, force if np.isfinite(force).all() else unknown) for key, label, force in points
-    ]
-    if not points and wanted is not None:  # a reference
-        return [(wanted, "", unknown)]
-    if not points:
-        raise ValueError(f"{options.record}: no point with a record")
-    return [*points]
+    wanted = options.measurement_id
+    given = (float("nan") if options.force_n is None else options.force_n), 0.0
+    points = [] if run is None else [of for of in run.results if of.blocks]
+    points = [of for of in points if wanted in (None, of.measurement_id)]
+    for of in points:
+        own = options.force_n is None and np.isfinite([of.force_n, of.force_std_n]).all()
+        force = (of.force_n, of.force_std_n) if own else given
+        yield of.measurement_id, f"point {of.index} {of.label}".strip(), *force
+    if not points:  # no run, or a reference of one
+        if run is not None and wanted is None:
+            raise ValueError(f"{options.record}: no point with a record")
+        yield wanted, "", *given
 
 
 def contact_as_text(analysis: ContactAnalysis, label: str = "") -> str:

@@ -62,7 +62,8 @@ def add_figure(parser: argparse._ActionsContainer, option: str, text: str) -> No
 def add_band(parser: argparse.ArgumentParser, default: str) -> None:
     """The option ``--band``; None where it is not given."""
     text = f"[Hz] of the fit; default: {default}"
-    parser.add_argument("--band", type=float, nargs=2, metavar=("LO", "HI"), help=text)
+    ends = ("LO", "HI")
+    parser.add_argument("--band", dest="band_hz", type=float, nargs=2, metavar=ends, help=text)
 
 
 def require_packages(*packages: str) -> None:

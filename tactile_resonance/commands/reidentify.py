@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
     structure = None if order is None else ModelStructure.with_residual(order)
     if structure is not None and terms is not None:
         structure = replace(structure, numerator_order=terms)
-    band_hz = None if options.band is None else band(options.band, "--band")
+    band_hz = None if options.band_hz is None else band(options.band_hz, "--band")
     different = len({run.resolve() for run in options.runs})
     require(different == len(options.runs), "RUN", [str(run) for run in options.runs], "each run once")
     output = options.output
