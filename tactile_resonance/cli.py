@@ -9,9 +9,17 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import NoReturn
 
 from tactile_resonance.processes import ENDING
+
+COMMANDS = (
+    *("plan", "bench_scan", "live", "analyze", "reidentify", "calibrate", "references"),
+    *("compare", "mechanics", "report", "figures", "benchmark", "calibrate_table", "simulate"),
+    *("check_robot", "compile"),
+)
+"""Modules of `commands`, in the order in which help lists them."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -79,37 +87,14 @@ def _parser() -> OneLineParser:
     # give. Before numpy is imported, which reads it once.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from tactile_resonance.commands import (
-        analyze,
-        bench_scan,
-        benchmark,
-        calibrate,
-        calibrate_table,
-        check_robot,
-        compare,
-        compile,
-        figures,
-        live,
-        mechanics,
-        plan,
-        references,
-        reidentify,
-        report,
-        simulate,
-    )
-
     parser = OneLineParser(
         prog="tactile_resonance",
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )
     parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (
-        *(plan, bench_scan, live, analyze, reidentify, calibrate, references),
-        *(compare, mechanics, report, figures, benchmark, calibrate_table, simulate),
-        *(check_robot, compile),
-    ):
-        command.add_parser(commands)
+    for name in COMMANDS:
+        import_module(f"tactile_resonance.commands.{name}").add_parser(commands)
     return parser
 
 
