@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.analysis import Analysis
 from tactile_resonance.calibration.fit import Fitted
 from tactile_resonance.calibration.records import Load
@@ -29,37 +30,26 @@ def draw_analysis(analysis: Analysis, title: str) -> Figure:
     axes = figure.subplot_mosaic([["whole", "whole", "poles"], ["band", "phase", "poles"]])
 
     whole = axes["whole"]
-    whole.plot(frf.frequency_hz, decibel(np.abs(frf.g) ** 2), ".", ms=2, label="|G|")
+    _dots(whole, frf.frequency_hz, np.abs(frf.g) ** 2, "|G|", 2)
     if frf.variance is not None:
-        whole.plot(
-            frf.frequency_hz, decibel(frf.variance), ".", ms=2, label="its standard deviation"
-        )
+        _dots(whole, frf.frequency_hz, frf.variance, "its standard deviation", 2)
     whole.axvspan(*poles.band_hz, color="0.9", label="band of the fit")
     whole.set(xlabel="frequency [Hz]", ylabel="[dB]")
     whole.legend(loc="best", fontsize="small")
 
     inside = frf.band(*poles.band_hz)
     band, phase = axes["band"], axes["phase"]
-    band.plot(inside.frequency_hz, decibel(np.abs(inside.g) ** 2), ".", ms=3, label="|G|")
+    _dots(band, inside.frequency_hz, np.abs(inside.g) ** 2, "|G|", 3)
     phase.plot(inside.frequency_hz, np.degrees(np.unwrap(np.angle(inside.g))), ".", ms=3)
     if poles.fit is not None:
         fine = np.linspace(*poles.band_hz, 1000)
         model = poles.fit.response(fine)
         band.plot(fine, decibel(np.abs(model) ** 2), "k-", lw=1, label="model")
         left = inside.g - poles.fit.response(inside.frequency_hz)
-        band.plot(
-            inside.frequency_hz,
-            decibel(np.abs(left) ** 2),
-            ".",
-            ms=3,
-            color="C3",
-            label="|G - model|",
-        )
+        _dots(band, inside.frequency_hz, np.abs(left) ** 2, "|G - model|", 3, color="C3")
         phase.plot(fine, np.degrees(np.unwrap(np.angle(model))), "k-", lw=1)
     if inside.variance is not None:
-        band.plot(
-            inside.frequency_hz, decibel(inside.variance), ".", ms=2, color="C1", label="std of G"
-        )
+        _dots(band, inside.frequency_hz, inside.variance, "std of G", 2, color="C1")
     band.set(xlabel="frequency [Hz]", ylabel="[dB]")
     band.legend(loc="best", fontsize="small")
     phase.set(xlabel="frequency [Hz]", ylabel="phase [degrees]")
@@ -100,10 +90,9 @@ def draw_calibration(fitted: Fitted, title: str) -> Figure:
         }
         above.set_title(record.name + value.get(record.load, ""), fontsize="medium")
         model = frf.g + residual * std
-        above.semilogx(frf.frequency_hz, decibel(np.abs(frf.g) ** 2), ".", ms=2, label="|G|")
+        _dots(above, frf.frequency_hz, np.abs(frf.g) ** 2, "|G|", 2)
         above.semilogx(frf.frequency_hz, decibel(np.abs(model) ** 2), "k-", lw=0.6, label="model")
-        gap = decibel(np.abs(residual * std) ** 2)
-        above.semilogx(frf.frequency_hz, gap, ".", ms=1, color="C3", label="|G - model|")
+        _dots(above, frf.frequency_hz, np.abs(residual * std) ** 2, "|G - model|", 1, color="C3")
         above.semilogx(frf.frequency_hz, decibel(std**2), "C1-", lw=0.8, label="std of G")
         below.semilogx(frf.frequency_hz, residual.real, ".", ms=1, label="real")
         below.semilogx(frf.frequency_hz, residual.imag, ".", ms=1, label="imaginary")
@@ -156,27 +145,24 @@ def draw_distortion_levels(cases: Mapping[float, Distortion], title: str) -> Fig
     return figure
 
 
+def _dots(
+    axes: Axes, frequency_hz: FloatArray, power: FloatArray, label: str, size: float, **style: Any
+) -> None:
+    """A power over frequency, in dB."""
+    axes.plot(frequency_hz, decibel(power), ".", ms=size, label=label, **style)
+
+
 def _draw_case(axes: Axes, distortion: Distortion) -> None:
     power = np.mean(np.abs(distortion.output) ** 2, axis=-2)
-    style: dict[str, Any] = {"marker": ".", "ms": 1.5, "ls": "none"}
-    axes.semilogx(
-        distortion.frequency_hz, decibel(power), color="k", label="linear output", **style
-    )
+    axes.set_xscale("log")
+    _dots(axes, distortion.frequency_hz, power, "linear output", 1.5, color="k")
     for name, colour in (("odd", "C3"), ("even", "C0")):
         lines = getattr(distortion, name)
         if lines.harmonics.size == 0:
             continue
-        axes.plot(
-            lines.frequency_hz,
-            decibel(lines.power),
-            color=colour,
-            label=_label(name, lines),
-            **style,
-        )
+        _dots(axes, lines.frequency_hz, lines.power, _label(name, lines), 1.5, color=colour)
         if lines.noise_power is not None and name == "even":
-            axes.plot(
-                lines.frequency_hz, decibel(lines.noise_power), color="0.6", label="noise", **style
-            )
+            _dots(axes, lines.frequency_hz, lines.noise_power, "noise", 1.5, color="0.6")
     axes.legend(fontsize="small", markerscale=4, loc="lower left")
     axes.grid(alpha=0.3)
 
@@ -202,15 +188,9 @@ def draw_variance(
     for k, source in enumerate(reversed(analysis.sources)):
         if source.variance is None:
             continue
-        axes.plot(
-            analysis.frequency_hz,
-            decibel(source.variance),
-            ".",
-            ms=2,
-            color=f"C{k}",
-            label=f"over {source.name}: {in_band.source(source.name).rms_level_db:.1f} dB of rms |G| in "
-            f"the band, {source.dof} degrees of freedom",
-        )
+        level_db = in_band.source(source.name).rms_level_db
+        label = f"over {source.name}: {level_db:.1f} dB of rms |G| in the band, {source.dof} degrees of freedom"
+        _dots(axes, analysis.frequency_hz, source.variance, label, 2, color=f"C{k}")
     axes.axvspan(*band_hz, color="0.92", zorder=0, label=f"band {band_hz[0]:g}-{band_hz[1]:g} Hz")
     axes.set(xlabel="frequency [Hz]", ylabel="[dB]", title=title)
     axes.legend(fontsize="small", markerscale=4)
