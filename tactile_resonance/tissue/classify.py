@@ -64,19 +64,12 @@ class TissueCall:
         Most probable class; `UNKNOWN` where the pole lies outside of all classes, or is not known.
     probability : float
         Of that class, given that it is one of the classes; NaN for `UNKNOWN`.
-    probabilities : dict of str to float
-        Of each class, given that it is one of them; empty where the pole is not known.
-    tail_probability : float
-        How often a member of the best fitting class lies as far from it as this pole, or farther; the pole
-        is `UNKNOWN` where this is below the level asked for. NaN where the pole is not known.
     reason : str
         Why it is `UNKNOWN`.
     """
 
     name: str
     probability: float
-    probabilities: dict[str, float]
-    tail_probability: float
     reason: str = ""
 
 
@@ -155,16 +148,15 @@ def classify(
     require(0 < unknown_level < 1, "unknown_level", unknown_level, "between 0 and 1")
     x, noise = np.asarray(estimate, float), np.asarray(covariance, float)
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(noise))):
-        return TissueCall(UNKNOWN, float("nan"), {}, float("nan"), "no pole with a covariance")
+        return TissueCall(UNKNOWN, float("nan"), "no pole with a covariance")
     posterior, tails = posteriors(x, noise, classes)
-    probabilities = {name: float(p) for name, p in zip(names, posterior, strict=True)}
     tail = float(tails.max())
     if tail < unknown_level:
         nearest = names[int(np.argmax(tails))]
         reason = f"farther from {nearest}, the nearest, than all but {tail:.2g} of its members"
-        return TissueCall(UNKNOWN, float("nan"), probabilities, tail, reason)
+        return TissueCall(UNKNOWN, float("nan"), reason)
     best = int(np.argmax(posterior))
-    return TissueCall(names[best], float(posterior[best]), probabilities, tail)
+    return TissueCall(names[best], float(posterior[best]))
 
 
 def posteriors(

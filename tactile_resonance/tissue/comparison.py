@@ -167,8 +167,6 @@ class Clusters:
         Of each group, without noise.
     probability : (n, K) float
         With which each point belongs to each.
-    log_likelihood : float
-    parameters : int
     bic : (Kmost,) float
         Bayesian information criterion of one group, two groups and so on, of fewer than 25 points as of 25; the
         number chosen has the least.
@@ -178,8 +176,6 @@ class Clusters:
     mean: FloatArray
     covariance: FloatArray
     probability: FloatArray
-    log_likelihood: float
-    parameters: int
     bic: FloatArray
 
     @property
@@ -236,18 +232,10 @@ def find_clusters(
     parameters = [(k - 1) + 2 * k + (0 if spread is not None else 3 * k) for k in range(1, len(tried) + 1)]
     counted = np.log(max(n, _FEWEST_COUNTED))
     bic = np.array([p * counted - 2 * m[-1] for p, m in zip(parameters, tried, strict=True)])
-    chosen = int(np.argmin(bic))
-    weight, mean, covariance, probability, log_likelihood = tried[chosen]
+    weight, mean, covariance, probability, _ = tried[int(np.argmin(bic))]
     order = np.argsort(mean[:, 0])
-    return Clusters(
-        weight[order],
-        mean[order] * unit,
-        covariance[order] * scale,
-        probability[:, order],
-        log_likelihood,
-        parameters[chosen],
-        bic,
-    )
+    covariance = covariance[order] * scale
+    return Clusters(weight[order], mean[order] * unit, covariance, probability[:, order], bic)
 
 
 def _mixture(

@@ -153,9 +153,7 @@ def test_likelihood_and_criterion_are_those_of_their_definitions():
             for one, c in zip(x, noise, strict=True)
         ]
         log_likelihood = float(logsumexp(each, axis=1).sum() + len(x) * np.log(unit).sum())
-        assert found.log_likelihood == pytest.approx(log_likelihood, abs=1e-4)
-        assert found.parameters == parameters
-        assert found.bic[1] == pytest.approx(parameters * np.log(30) - 2 * log_likelihood, abs=1e-3)
+        assert found.bic[1] == pytest.approx(parameters * np.log(30) - 2 * log_likelihood, abs=2e-4)
         assert np.argmin(found.bic) == 1
         if known is not None:
             np.testing.assert_allclose(found.covariance, [spread] * 2)

@@ -7,7 +7,7 @@ from scipy import stats
 from tissue.reference_points import NOISE, SOURCES, drawn, joined
 
 from tactile_resonance.frf.variance_analysis import nested_means
-from tactile_resonance.tissue.classify import classify
+from tactile_resonance.tissue.classify import posteriors
 from tactile_resonance.tissue.spread import LEVELS, not_negative, spreads_of
 
 
@@ -120,7 +120,7 @@ def test_the_next_preparation_lies_outside_as_often_as_stated(preparations):
         drawn_all = drawn(rng, [(2, 2)] * preparations + [(1,)])
         (spread,) = spreads_of(drawn_all.where(np.arange(4 * preparations + 1) < 4 * preparations))
         x = drawn_all.estimate[-1]
-        tails.append(classify(x, NOISE, [spread.as_class()]).tail_probability)
+        tails.append(posteriors(x, NOISE, [spread.as_class()])[1][0])
         off = x - spread.mean
         plug_in.append(stats.chi2.sf(off @ np.linalg.solve(spread.covariance + NOISE, off), 2))
     for level in (0.01, 0.05):
