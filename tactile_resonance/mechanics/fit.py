@@ -83,8 +83,6 @@ class Fit:
     equilibrium_known : Known
     surface_m, surface_std_m : float
         Depth of the robot at which the ball touches.
-    zero_n, zero_drift_n_per_s : float
-        Of the force.
     covariance : (2 n + 1, 2 n + 1) array
         From noise alone, of the logarithms of Einf, E_1.., tau_1..; in the order of `terms`.
     beyond : Prony or None
@@ -94,13 +92,12 @@ class Fit:
         covariance is larger by that.
     bic : tuple of float
         Of one term, two and so on, for comparison: the number of terms is that of an F test, at 5 %.
-    begin_s, ramp_s, hold_s : float
-        First touch, and durations.
+    ramp_s, hold_s : float
     peak_force_n, relaxed_share : float
         Largest force, and the share of it that is gone at the end of the hold, by the model without noise.
     time_s, force_n, indentation_m : (N,) arrays
-        The model at the means: force less its zero, and depth of the ball.
-    measured_n, measured_std_n : (N,) arrays
+        The model at the means: time from the touch, force less its zero, and depth of the ball.
+    measured_n : (N,) array
         The means, less the zero.
     contact_ratio : float
         Largest contact radius over that of the ball.
@@ -117,14 +114,11 @@ class Fit:
     equilibrium_known: Known
     surface_m: float
     surface_std_m: float
-    zero_n: float
-    zero_drift_n_per_s: float
     covariance: FloatArray
     beyond: Prony | None
     chi_square: float
     dof: int
     bic: tuple[float, ...]
-    begin_s: float
     ramp_s: float
     hold_s: float
     peak_force_n: float
@@ -133,7 +127,6 @@ class Fit:
     force_n: FloatArray
     indentation_m: FloatArray
     measured_n: FloatArray
-    measured_std_n: FloatArray
     contact_ratio: float
     sphere_share: float
     layer_share: float
@@ -272,8 +265,6 @@ def _result(
         equilibrium_known=equilibrium,
         surface_m=float(surface),
         surface_std_m=float(std[-3]),
-        zero_n=float(zero),
-        zero_drift_n_per_s=float(drift),
         covariance=covariance[: 2 * n + 1, : 2 * n + 1],
         beyond=beyond,
         chi_square=best.chi_square,
@@ -281,7 +272,6 @@ def _result(
         bic=tuple(
             count * np.log(s.chi_square / count) + 2 * s.terms * np.log(count) for s in tried
         ),
-        begin_s=means.begin_s,
         ramp_s=means.ramp_s,
         hold_s=means.hold_s,
         peak_force_n=peak,
@@ -290,7 +280,6 @@ def _result(
         force_n=force[0],
         indentation_m=ball_m[0],
         measured_n=measured,
-        measured_std_n=means.std_n,
         contact_ratio=ratio,
         sphere_share=sphere,
         layer_share=layer,

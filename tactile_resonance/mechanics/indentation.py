@@ -136,8 +136,6 @@ class Means:
     begin_s, ramp_s, end_s : float
         When the tip touches, how long it presses until depth or force is nearly there, and when the hold
         ends.
-    noise_n : float
-        Of one force.
     """
 
     time_s: FloatArray
@@ -151,7 +149,6 @@ class Means:
     begin_s: float
     ramp_s: float
     end_s: float
-    noise_n: float
 
     @property
     def hold_s(self) -> float:
@@ -227,7 +224,6 @@ def means_of(test: IndentationRecord) -> Means:
         float(time[first]),
         float(time[ramp] - time[first]),
         float(time[last]),
-        noise,
     )
 
 
