@@ -146,7 +146,7 @@ def _share(inside: Any, digits: int = 3, confidence: float = 0.999) -> str:
 
 
 def _parameter_lines(made: Sequence[CalibratedBench]) -> list[str]:
-    names = made[0].calibration.names
+    names = made[0].calibration.model.names
     wrong = [at for at in made if np.isnan(at.off).any()]
     right = [at for at in made if not np.isnan(at.off).any()]
     off = np.array([at.off for at in right])  # (benches, p)
@@ -274,7 +274,7 @@ def _draw(
     figure.suptitle(f"{len(made)} sensors calibrated from records ({SIMULATED})")
     left, middle, right = figure.subplots(1, 3)
     off = np.array([at.off for at in made if not np.isnan(at.off).any()])
-    names = made[0].calibration.names
+    names = made[0].calibration.model.names
     for k in range(len(names)):
         left.plot(np.full(len(off), k), off[:, k], ".", ms=3, color=f"C{min(k // 10, 4)}")
     for level in (-1.96, 1.96):

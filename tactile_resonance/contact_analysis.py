@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -185,12 +185,7 @@ def contact_content(analysis: ContactAnalysis) -> dict[str, Any]:
         "degrees_of_freedom": int(contact.poles.expected_cost),
         "status": contact.status.value,
         "moduli": {
-            "storage_pa": known(found.storage_pa),
-            "storage_std_pa": known(found.storage_std_pa),
-            "loss_pa": known(found.loss_pa),
-            "loss_std_pa": known(found.loss_std_pa),
-            "contact_radius_m": known(found.contact_radius_m),
-            "radius_ratio": known(found.radius_ratio),
+            **{name: known(value) for name, value in asdict(found).items() if isinstance(value, float)},
             "status": found.status.value,
         },
         "black_box": None,

@@ -197,11 +197,6 @@ class TissueContact:
     poles: Poles
     status: ContactStatus
 
-    @property
-    def contact(self) -> ContactStiffness:
-        """k*(s)."""
-        return self.prior.stiffness(self.parameters)
-
 
 @dataclass(frozen=True)
 class Moduli:
@@ -209,9 +204,8 @@ class Moduli:
 
     Attributes
     ----------
-    storage_pa, loss_pa : float
-        Of the modulus at the mode, radiation taken off.
-    storage_std_pa, loss_std_pa : float
+    storage_pa, storage_std_pa, loss_pa, loss_std_pa : float
+        Of the modulus at the mode, radiation taken off; NaN where there is no radius.
     contact_radius_m : float
     radius_ratio : float
         Over the ball's.
@@ -220,14 +214,14 @@ class Moduli:
     message : str
     """
 
-    storage_pa: float
-    loss_pa: float
-    storage_std_pa: float
-    loss_std_pa: float
-    contact_radius_m: float
-    radius_ratio: float
     status: ContactStatus
     message: str
+    storage_pa: float = float("nan")
+    storage_std_pa: float = float("nan")
+    loss_pa: float = float("nan")
+    loss_std_pa: float = float("nan")
+    contact_radius_m: float = float("nan")
+    radius_ratio: float = float("nan")
 
 
 def moduli(estimate: TissueContact, relaxed_ratio: float = 1.0) -> Moduli:
@@ -246,10 +240,9 @@ def moduli(estimate: TissueContact, relaxed_ratio: float = 1.0) -> Moduli:
     ``E' = (1 - nu^2) sqrt(k'^3 / (6 F R ratio))``.
     """
     prior, radius_of_tip = estimate.prior, estimate.prior.tip_radius_m
-    nan = float("nan")
     if not np.isfinite(prior.force_n):
-        status, why = ContactStatus.NO_FORCE, "no force, hence no contact radius and no modulus"
-        return Moduli(nan, nan, nan, nan, nan, nan, status, why)
+        why = "no force, hence no contact radius and no modulus"
+        return Moduli(ContactStatus.NO_FORCE, why)
     frequency_hz = float(estimate.poles.f0_hz[0])
     s = 2j * np.pi * frequency_hz
 
@@ -274,7 +267,7 @@ def moduli(estimate: TissueContact, relaxed_ratio: float = 1.0) -> Moduli:
         status = ContactStatus.BEYOND_HERTZ
         message = f"contact radius {ratio:.2f} of the ball's, strict Hertz reaches {STRICT_HERTZ:g}"
     (storage, loss), (storage_std, loss_std) = found.tolist(), std.tolist()
-    return Moduli(storage, loss, storage_std, loss_std, radius, ratio, status, message)
+    return Moduli(status, message, storage, storage_std, loss, loss_std, radius, ratio)
 
 
 def slope_of(function: Callable[[FloatArray], FloatArray], p: FloatArray) -> FloatArray:

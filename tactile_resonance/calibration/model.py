@@ -27,11 +27,6 @@ PER_MODE = ("natural_rad_s", "damping_ratio", "coupling_rad_s", "tip_deflection"
 SINGLE = ("feedthrough", "leak_rad_s", "gain", "delay_s")
 
 
-def parameter_names(modes: int) -> tuple[str, ...]:
-    """(4 modes + 4,) names of all parameters in the order of `SensorModel.values`."""
-    return (*(f"{name}[{i + 1}]" for name in PER_MODE for i in range(modes)), *SINGLE)
-
-
 @dataclass(frozen=True, eq=False)
 class ContactStiffness:
     """``k(s) = K + sum_j K_j s tau_j / (1 + s tau_j) + c s + m s^2``; leading axes (...) are a stack.
@@ -113,8 +108,13 @@ class SensorModel:
         return self.natural_rad_s.shape[-1]
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """(4 n + 4,) of all parameters."""
+        return (*(f"{name}[{i + 1}]" for name in PER_MODE for i in range(self.modes)), *SINGLE)
+
+    @property
     def values(self) -> FloatArray:
-        """(..., 4 n + 4) all parameters, in the order of `parameter_names`."""
+        """(..., 4 n + 4) all parameters, in the order of `names`."""
         single = [np.asarray(getattr(self, name))[..., None] for name in SINGLE]
         return np.concatenate([*(getattr(self, name) for name in PER_MODE), *single], axis=-1)
 
@@ -126,16 +126,15 @@ class SensorModel:
         per_mode = (x[..., i * n : (i + 1) * n] for i in range(len(PER_MODE)))
         return cls(*per_mode, *np.moveaxis(x[..., 4 * n :], -1, 0))
 
-    def modal_sums(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """A, B and C at s [rad/s] of shape (..., S), each (..., S)."""
-        inverse = 1 / self._denominators(s)  # (..., S, n)
+    def _sums(self, inverse: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """A, B and C of 1 / D_i (..., S, n), or their slopes of its slope, each (..., S)."""
         chi, phi = self.coupling_rad_s[..., None, :], self.tip_deflection[..., None, :]
         weights = (chi**2, chi * phi, phi**2)
         return tuple((inverse * weight).sum(axis=-1) for weight in weights)
 
     def response(self, s: ComplexArray, stiffness: ComplexArray | float = 0.0) -> ComplexArray:
         """(..., S) G at s [rad/s] on a contact of this stiffness there [N/m]; 0: in air."""
-        a, b, c = self.modal_sums(s)
+        a, b, c = self._sums(1 / self._denominators(s)[0])
         x = a - stiffness * b**2 / (1 + stiffness * c)
         gamma, leak, gain, delay = (np.asarray(getattr(self, name))[..., None] for name in SINGLE)
         return gain * np.exp(-s * delay) * (gamma + x) / (1 + x + leak / s)
@@ -177,26 +176,20 @@ class SensorModel:
 
     def residues(self, poles: ComplexArray, contact: ContactStiffness) -> ComplexArray:
         """(..., N) residues of ``G / (gain exp(-s delay))`` at poles (..., N) [rad/s]."""
-        a, b, c = self.modal_sums(poles)
-        da, db, dc = self._modal_slopes(poles)
+        denominator, slope = self._denominators(poles)
+        a, b, c = self._sums(1 / denominator)
+        da, db, dc = self._sums(-slope / denominator**2)
         k, dk = contact.at(poles), contact.slope(poles)
         loop = 1 + k * c
         dx = da - (2 * k * b * db + dk * b**2) / loop + k * b**2 * (dk * c + k * dc) / loop**2
         gamma, leak = (np.asarray(getattr(self, name))[..., None] for name in SINGLE[:2])
         return (gamma - 1 - leak / poles) / (dx - leak / poles**2)
 
-    def _denominators(self, s: ComplexArray) -> ComplexArray:
+    def _denominators(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """(..., S, n) D_i at s (..., S), and their slopes."""
         s = np.asarray(s)[..., None]  # (..., S, 1)
         w, zeta = self.natural_rad_s[..., None, :], self.damping_ratio[..., None, :]
-        return np.asarray(s**2 + 2 * zeta * w * s + w**2)
-
-    def _modal_slopes(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Derivatives of A, B and C by s, each (..., S)."""
-        w, zeta = self.natural_rad_s[..., None, :], self.damping_ratio[..., None, :]
-        slope = -(2 * np.asarray(s)[..., None] + 2 * zeta * w) / self._denominators(s) ** 2
-        chi, phi = self.coupling_rad_s[..., None, :], self.tip_deflection[..., None, :]
-        weights = (chi**2, chi * phi, phi**2)
-        return tuple((slope * weight).sum(axis=-1) for weight in weights)
+        return np.asarray(s**2 + 2 * zeta * w * s + w**2), np.asarray(2 * s + 2 * zeta * w)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,11 +226,6 @@ class Calibration:
     def std(self) -> FloatArray:
         """(p,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(p,) of the parameters."""
-        return parameter_names(self.model.modes)
 
     def knows_tip(self) -> bool:
         """Whether the first two mode shapes at the tip are determined, without which no contact is."""

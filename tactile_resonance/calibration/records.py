@@ -108,10 +108,8 @@ class CalibrationRecord:
         return np.asarray(2j * np.pi * self.frf.frequency_hz, complex)
 
     def stiffness(self, s: ComplexArray) -> ComplexArray:
-        """(F,) stiffness at the tip for a value of 1."""
-        return (
-            s**2 if self.load is Load.MASS else np.full(s.shape, self.load is Load.SPRING, complex)
-        )
+        """(F,) stiffness at the tip for a mass or spring of 1."""
+        return s**2 if self.load is Load.MASS else np.ones_like(s)
 
     @property
     def variance(self) -> FloatArray:
@@ -186,12 +184,11 @@ def _local_fit(s: ComplexArray, h: ComplexArray, at: int) -> tuple[float, float,
     weight = 1 / np.abs(z**2 + 0.02 * z + 1)
     rows, right = columns * weight[:, None], -(z**2) * y * weight
     real = np.concatenate([rows.real, rows.imag]), np.concatenate([right.real, right.imag])
-    a, b, *rest = np.linalg.lstsq(*real, rcond=None)[0]
+    a, b, *line = np.linalg.lstsq(*real, rcond=None)[0]
     natural = np.sqrt(b) if 0.9 < b < 1.1 else 1.0
     zeta = a / 2 / natural if 1e-4 < a / 2 < 0.3 else 0.01
     pole = natural * (-zeta + 1j * np.sqrt(1 - zeta**2))
-    numerator = np.polyval([*rest[::-1]], pole) if rest else 0.0
-    strength = numerator.real
+    strength = np.polyval(line[::-1], pole).real
     if not strength > 0:
         strength = -2 * zeta * h[at].imag
     return float(natural * w), float(zeta), float(strength * w**2)

@@ -198,7 +198,7 @@ def as_text(fitted: Fitted, truth: np.ndarray | None = None) -> str:
     if truth is not None and truth.size != size:
         truth = None
     for k, (name, value, std) in enumerate(
-        zip(made.names, made.model.values, made.std, strict=True)
+        zip(made.model.names, made.model.values, made.std, strict=True)
     ):
         line = f"{name:22s}{value:14.8g}{std:11.2g}"
         if not made.determined[k]:

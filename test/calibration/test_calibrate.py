@@ -19,7 +19,7 @@ def test_every_parameter_is_within_its_deviations(fitted, truth):
     assert found.determined.all()
     assert found.model.modes == 10
     off = (found.model.values - truth.values) / found.std
-    assert np.abs(off).max() < 4, dict(zip(found.names, off, strict=True))
+    assert np.abs(off).max() < 4, dict(zip(found.model.names, off, strict=True))
     # 44 parameters: with .95 each, fewer than 36 inside once in a thousand
     assert np.count_nonzero(np.abs(off) < 1.96) >= 36
     # a thousandth of the mode's frequency is .25 Hz, its deviation far below
@@ -47,7 +47,7 @@ def test_without_a_load_the_tip_is_declared_unknown(records, truth):
 
 def test_without_a_loopback_the_gain_is_declared_assumed(records):
     found = calibrate(of_loads(records, "air", "mass")).calibration
-    at = found.names.index("gain")
+    at = found.model.names.index("gain")
     assert not found.determined[at]
     assert found.model.gain == 1
     assert "no loop-back" in found.message

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.calibration.model import AIR, ContactStiffness, SensorModel, parameter_names
+from tactile_resonance.calibration.model import AIR, ContactStiffness, SensorModel
 from tactile_resonance.simulation.sensor.experiments import true_sensor
 
 TISSUES = ("gel10", "gel16", "cortex", "liver", "tumour")
@@ -58,7 +58,7 @@ def test_parameters_in_one_array_and_back_also_stacked(bench):
     values = np.stack([model.values, 1.01 * model.values])
     stack = SensorModel.of_values(values)
     np.testing.assert_array_equal(stack.values, values)
-    assert len(parameter_names(model.modes)) == values.shape[1]
+    assert len(model.names) == values.shape[1]
     contact = ContactStiffness(50.0, np.array([20.0]), np.array([1e-3]))
     both = stack.poles(contact)
     for one, found in zip(values, both, strict=True):
