@@ -43,27 +43,20 @@ _MOST_MEANS = 160  # of a mechanical test
 _ACROSS_HALF_WIDTHS = 6.0  # about a pole, in which half of the model's points lie
 
 
-@cache
 def _asset(name: str) -> str:
     return (resources.files(__package__) / "assets" / name).read_text(encoding="utf-8")
 
 
 @cache
-def _plotly() -> str:
+def _scripts() -> tuple[str, str]:
+    """Both scripts as elements of HTML, and their hashes as a Content-Security-Policy takes them."""
     try:
-        return (resources.files("plotly") / "package_data" / "plotly.min.js").read_text(
-            encoding="utf-8"
-        )
+        plotly = resources.files("plotly") / "package_data" / "plotly.min.js"
+        texts = (plotly.read_text(encoding="utf-8"), _asset("page.js"))
     except (ModuleNotFoundError, FileNotFoundError) as error:
         raise ValueError(
             f"report: plotly.js was not found ({error}); the page needs 'pip install plotly'"
         ) from error
-
-
-@cache
-def _scripts() -> tuple[str, str]:
-    """Both scripts as elements of HTML, and their hashes as a Content-Security-Policy takes them."""
-    texts = (_plotly(), _asset("page.js"))
     digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in texts)
     return (
         "".join(f"<script>{text}</script>" for text in texts),
