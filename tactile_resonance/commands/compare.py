@@ -8,7 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from tactile_resonance.commands.options import add_file, add_output, add_runs
-from tactile_resonance.fields import counted
+from tactile_resonance.fields import counted, require
 from tactile_resonance.files import csv_text, write_whole
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from tactile_resonance.commands.references import print_left_out, read_runs
-    from tactile_resonance.fields import require
     from tactile_resonance.report.drawing import save_figure
     from tactile_resonance.report.tissue_figures import draw_comparison
     from tactile_resonance.scan.labels import nominal_of, read_nominal, referred, run_names

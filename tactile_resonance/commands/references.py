@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_resonance.commands.options import add_figure, add_file, add_output, add_runs
-from tactile_resonance.fields import counted
+from tactile_resonance.fields import counted, require
 from tactile_resonance.files import write_whole
 
 if TYPE_CHECKING:
@@ -221,8 +221,6 @@ def print_variance(
 
 
 def _check_level(level: float) -> None:
-    from tactile_resonance.fields import require
-
     require(0 < level < 1, "--unknown-level", level, "a number above 0, below 1")
 
 

@@ -143,7 +143,7 @@ class TissueSpread:
         """Whether there are points enough for a class."""
         return self.degrees_of_freedom > 1
 
-    def as_class(self, prior: float = 1.0) -> TissueClass:
+    def as_class(self) -> TissueClass:
         """The class, with the predictive distribution of so few samples.
 
         Raises
@@ -154,9 +154,7 @@ class TissueSpread:
         accepted = "more than 1: more preparations, or spreads pooled over tissues"
         degrees = self.degrees_of_freedom
         require(self.usable, f"{self.name}: degrees_of_freedom", degrees, accepted)
-        return predictive_class(
-            self.name, self.mean, self.covariance, self.degrees_of_freedom, prior
-        )
+        return predictive_class(self.name, self.mean, self.covariance, degrees)
 
 
 def spreads_of(points: ReferencePoints, pool: bool = False) -> tuple[TissueSpread, ...]:

@@ -101,8 +101,7 @@ class ReliabilityBin:
     ----------
     stated, right : float
         Mean stated probability, and the part of the points that were of the class.
-    points, groups : int
-        Groups are those of `Share`.
+    points : int
     low, high : float
         Between which `right` is expected if the stated probabilities hold, in all bins together.
     """
@@ -110,7 +109,6 @@ class ReliabilityBin:
     stated: float
     right: float
     points: int
-    groups: int
     low: float
     high: float
 
@@ -192,9 +190,6 @@ def reliability(trial: Trial, confidence: float = 0.95) -> tuple[ReliabilityBin,
         groups = np.unique(counted.preparation[chosen]).size
         low, high = stats.binom.interval(1 - beyond, groups, stated)
         share = float(right[chosen].mean())
-        made.append(
-            ReliabilityBin(
-                stated, share, int(chosen.sum()), groups, float(low) / groups, float(high) / groups
-            )
-        )
+        limits = float(low) / groups, float(high) / groups
+        made.append(ReliabilityBin(stated, share, int(chosen.sum()), *limits))
     return tuple(made)

@@ -12,7 +12,7 @@ from tactile_resonance.scan.scene import Hold, OnFailure, Output, read_scan_scen
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
-from tactile_resonance.tissue.classify import classify
+from tactile_resonance.tissue.classify import classify, posteriors
 from tactile_resonance.tissue.nominal_contact import ContactLoad, refer_to_nominal
 from tactile_resonance.tissue.references import read_classes
 
@@ -76,7 +76,7 @@ def test_classes_of_the_inclusion_are_the_benchs_own():
     def tail(percent, force_n, age_s):
         x = poles(gelatine(percent), force_n, age_s)
         at = refer_to_nominal(x, noise, ContactLoad(force_n, 5e-5, age_s), nominal)
-        return classify(at.compared, at.covariance, [plain]).tail_probability
+        return posteriors(at.compared, at.covariance, [plain])[1][0]
 
     tails = [
         tail(
