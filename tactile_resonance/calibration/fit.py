@@ -87,7 +87,7 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
 
     def without_loads(start: SensorModel, steps: int) -> tuple[SensorModel, float]:
         problem = _Records([*air, *loopback], start.modes, free_gain=bool(loopback), free_tip=False)
-        solved = problem.solved(problem.start(start), steps)
+        solved = problem.solved(start, steps)
         return SensorModel.of_values(solved.values), float(np.sum(solved.residual**2))
 
     first, squares = without_loads(start, MOST_STEPS)
@@ -99,13 +99,13 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
     if loaded:
         first = replace(first, tip_deflection=start_tip(loaded, first, shown))
     problem = _Records(records, first.modes, free_gain=bool(loopback), free_tip=bool(loaded))
-    begun = problem.solved(problem.start(first))
+    begun = problem.solved(first)
     # what repeats in every period, as the steps of a converter do, no variance over periods shows
     squares_of = [np.mean(part**2) for part in problem.parts(begun.residual)]
     excess = np.maximum(1.0, squares_of)
     problem.widen(excess)
     contradiction = problem.widen_loads(begun)
-    solved = problem.solved(problem.start(SensorModel.of_values(begun.values)))
+    solved = problem.solved(SensorModel.of_values(begun.values))
     return _fitted(problem, solved, excess, contradiction, bool(loopback))
 
 
@@ -140,17 +140,6 @@ class _Records:
         self._known_stds = np.array([max(r.value_std / r.value, 1e-9) for r in self.known])
         self._s = [record.s_rad_s for record in self.records]
         self._root = [np.sqrt(record.variance / 2) for record in self.records]
-        relative = np.full(count, UNDETERMINED)
-        relative[4 * modes], relative[4 * modes + 3] = FEEDTHROUGH_STD, DELAY_STD_S
-        self.limits = relative  # in internal units, but for the tip: see `start`
-
-    def start(self, sensor: SensorModel) -> FloatArray:
-        """Internal values at which the fit begins."""
-        n, x = self.modes, sensor.values.copy()
-        scale = np.abs(x[3 * n : 4 * n])
-        self.limits[3 * n : 4 * n] = UNDETERMINED * np.where(scale > 0, scale, 1.0)
-        x[self._log] = np.log(x[self._log])
-        return np.concatenate([x, np.zeros(len(self.known))])
 
     def natural(self, x: FloatArray) -> FloatArray:
         """(4 n + 4,) parameters as `SensorModel` has them."""
@@ -158,10 +147,16 @@ class _Records:
         out[self._log] = np.exp(out[self._log])
         return out
 
-    def solved(self, start: FloatArray, steps: int = MOST_STEPS) -> _Solved:
-        """Least squares from a start."""
+    def solved(self, sensor: SensorModel, steps: int = MOST_STEPS) -> _Solved:
+        """Least squares from the parameters of a sensor on."""
+        n, x = self.modes, sensor.values.copy()
+        tip, limits = np.abs(x[3 * n : 4 * n]), np.full(x.size, UNDETERMINED)
+        limits[3 * n : 4 * n] *= np.where(tip > 0, tip, 1.0)
+        limits[4 * n], limits[4 * n + 3] = FEEDTHROUGH_STD, DELAY_STD_S
+        x[self._log] = np.log(x[self._log])
+        start = np.concatenate([x, np.zeros(len(self.known))])
         active = np.concatenate([self.free, np.ones(len(self.known), bool)])
-        scale = np.concatenate([self.limits, np.ones(len(self.known))])[active]
+        scale = np.concatenate([limits, np.ones(len(self.known))])[active]
 
         def whole(z: FloatArray) -> FloatArray:
             x = start.copy()
