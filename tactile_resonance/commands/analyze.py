@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -50,50 +50,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         type=Path,
         help=".npz, .mat or .csv file, or a folder: records of the nodes, a scan's run",
     )
-    parser.add_argument(
-        "--measurement",
-        dest="measurement_id",
-        type=int,
-        metavar="ID",
-        help="which one of a folder with several",
-    )
-    parser.add_argument(
-        "--point",
-        type=int,
-        metavar="N",
-        help="of a run in place of --measurement: its point N, from 1",
-    )
-    parser.add_argument("--u", metavar="FIELD", help="actuator field (default: u)")
-    parser.add_argument("--y", metavar="FIELD", help="sensor field (default: y)")
-    parser.add_argument(
-        "--sample-rate",
-        dest="sample_rate_hz",
-        type=float,
-        metavar="HZ",
-        help="wins over the file's",
-    )
-    parser.add_argument("--samples-per-period", type=int, metavar="N", help="wins over the file's")
-    parser.add_argument(
-        "--periods",
-        type=int,
-        metavar="P",
-        help="use the first P periods; where the period is not known, the record has P of them",
-    )
-    parser.add_argument(
-        "--segments",
-        type=parse_segments,
-        metavar="START:STOP,...",
-        help="cut realisations out of a longer recording (samples, stop excluded); each is one period "
-        "unless --samples-per-period or --periods says otherwise",
-    )
-    parser.add_argument(
-        "--harmonics",
-        dest="excited_harmonics",
-        type=parse_harmonics,
-        metavar="H,FIRST:LAST:STEP,...",
-        help="excited multiples of the sample rate over the samples per period, LAST included; "
-        "default: the file's, else found from the spectrum of u",
-    )
+    for option, field, kind, metavar, text in _OF_RECORDS:
+        parser.add_argument(option, dest=field, type=kind, metavar=metavar, help=text)
     add_band(parser, "of a run that of its scene, else around the strongest resonance")
     parser.add_argument(
         "--order",
@@ -213,6 +171,31 @@ def parse_harmonics(text: str) -> IntArray:
             f"1 <= FIRST <= LAST <= {MOST_HARMONICS} and STEP >= 1"
         ) from None
     return np.array(sorted(found), np.int64)
+
+
+_OF_RECORDS: tuple[tuple[str, str, Callable[[str], Any], str, str], ...] = (
+    ("--measurement", "measurement_id", int, "ID", "which one of a folder with several"),
+    ("--point", "point", int, "N", "of a run in place of --measurement: its point N, from 1"),
+    ("--u", "u", str, "FIELD", "actuator field (default: u)"),
+    ("--y", "y", str, "FIELD", "sensor field (default: y)"),
+    ("--sample-rate", "sample_rate_hz", float, "HZ", "wins over the file's"),
+    ("--samples-per-period", "samples_per_period", int, "N", "wins over the file's"),
+    (
+        *("--periods", "periods", int, "P"),
+        "use the first P periods; where the period is not known, the record has P of them",
+    ),
+    (
+        *("--segments", "segments", parse_segments, "START:STOP,..."),
+        "cut realisations out of a longer recording (samples, stop excluded); each is one period "
+        "unless --samples-per-period or --periods says otherwise",
+    ),
+    (
+        *("--harmonics", "excited_harmonics", parse_harmonics, "H,FIRST:LAST:STEP,..."),
+        "excited multiples of the sample rate over the samples per period, LAST included; "
+        "default: the file's, else found from the spectrum of u",
+    ),
+)
+"""Options that say what is read: each with its field of `read_record`, kind, placeholder and help."""
 
 
 def run(options: argparse.Namespace) -> int:
