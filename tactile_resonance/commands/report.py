@@ -52,14 +52,10 @@ def run(options: argparse.Namespace) -> int:
 def _compare(folders: Sequence[Path], output: Path) -> int:
     # only here: the command answers --help without the library for recordings
     from tactile_resonance.front import read_run
-    from tactile_resonance.report.boundary import boundary_of_run
     from tactile_resonance.report.comparison import as_comparison, differences, sentence, unlike
-    from tactile_resonance.report.point_details import MOST_DETAILED, details_of
 
     runs = [read_run(folder) for folder in folders]
-    details = [details_of(content, MOST_DETAILED // len(runs)) for content in runs]
-    page = as_comparison(runs, details, [boundary_of_run(content) for content in runs])
-    write_whole(output, page.encode())
+    write_whole(output, as_comparison(runs).encode())
     for folder, content in zip(folders[1:], runs[1:], strict=True):
         found, apart = differences(runs[0], content), unlike(runs[0], content)
         print(sentence(str(folder), str(folders[0]), found, apart))

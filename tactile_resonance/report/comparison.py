@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import html
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import counted
 from tactile_resonance.report import run_tables as tables
-from tactile_resonance.report.boundary import RunBoundary
+from tactile_resonance.report.boundary import boundary_of_run
 from tactile_resonance.report.page import HIGH, LOW, MM, listed, page, page_data
-from tactile_resonance.report.point_details import PointDetails
+from tactile_resonance.report.point_details import MOST_DETAILED, details_of
 from tactile_resonance.report.run_report import (
     median_std,
     pole_maps_of,
@@ -165,47 +165,27 @@ def sentence(name: str, first: str, found: Sequence[Difference], apart: Sequence
     )
 
 
-def as_comparison(
-    runs: Sequence[RunContent],
-    details: Sequence[Mapping[int, PointDetails]],
-    boundaries: Sequence[RunBoundary | None],
-) -> str:
-    """HTML of runs beside each other; the first one is what the others are compared with.
-
-    Parameters
-    ----------
-    runs : sequence of RunContent
-        Two or more.
-    details : sequence of mapping of int to PointDetails
-        Of each run, by point, as far as they are to be in the page.
-    boundaries : sequence of RunBoundary or None
-        Of each run, where one was wanted.
-    """
-    names = _names(runs)
-    pairs = [differences(runs[0], run) for run in runs[1:]]
-    warned = [
-        f"{name}: {line}"
-        for name, run, boundary, each in zip(names, runs, boundaries, details, strict=True)
-        for line in warnings_of(run, boundary, each)
-    ]
-    sentences = [
-        sentence(name, names[0], found, unlike(runs[0], run))
-        for name, run, found in zip(names[1:], runs[1:], pairs, strict=True)
-    ]
+def as_comparison(runs: Sequence[RunContent]) -> str:
+    """HTML of two runs or more beside each other; the first one is what the others are compared with."""
+    names, entries, warned = _names(runs), [], []
+    details = [details_of(run, MOST_DETAILED // len(runs)) for run in runs]
+    detailed = sum(map(len, details))
+    for name, run, each in zip(names, runs, details, strict=True):
+        boundary = boundary_of_run(run)
+        warned += [f"{name}: {line}" for line in warnings_of(run, boundary, each)]
+        entries.append(run_entry(run, name, pole_maps_of(run), each, boundary, detailed))
+    sentences, figures, below = [], [], f"<h2>Runs</h2>{_runs_table(runs, names)}"
+    for name, run in zip(names[1:], runs[1:], strict=True):
+        what, found = f"{name} less {names[0]}", differences(runs[0], run)
+        sentences.append(sentence(name, names[0], found, unlike(runs[0], run)))
+        figures.append(_figure(f"{what}, change of f0", found))
+        if found:
+            below += f"<h2>{html.escape(what)}</h2>{_differences_table(found)}"
     title = f"Comparison of {', '.join(names)}"
     head = (
         f"<h1>{html.escape(title)}</h1>{tables.warning_list(warned)}{tables.paragraphs(sentences)}"
     )
-    entries = [
-        run_entry(run, name, pole_maps_of(run), each, boundary, sum(map(len, details)))
-        for run, name, each, boundary in zip(runs, names, details, boundaries, strict=True)
-    ]
-    figures = [_figure(name, names[0], found) for name, found in zip(names[1:], pairs, strict=True)]
-    below = f"<h2>Runs</h2>{_runs_table(runs, names)}"
-    for name, found in zip(names[1:], pairs, strict=True):
-        if found:
-            below += f"<h2>{html.escape(f'{name} less {names[0]}')}</h2>{_differences_table(found)}"
-    data = page_data(entries, figures, sum(map(len, details)), "Differences at common places")
+    data = page_data(entries, figures, "Differences at common places")
     return page(title, head, data, below)
 
 
@@ -266,9 +246,8 @@ def _differences_table(found: Sequence[Difference]) -> str:
     return tables.text_table((*columns, "tissue", "tissue of the other"), rows)
 
 
-def _figure(name: str, first: str, found: Sequence[Difference]) -> dict[str, Any]:
+def _figure(title: str, found: Sequence[Difference]) -> dict[str, Any]:
     """Places in the colours of the change of f0 in standard deviations."""
-    title = f"{name} less {first}, change of f0"
     if not found:
         return {"title": title, "note": "Left out: no place in common.", "traces": [], "layout": {}}
     where = MM * np.array([each.first.position_m[:2] for each in found])

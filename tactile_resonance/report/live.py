@@ -242,7 +242,7 @@ class LiveRun:
         return f"{told}; {self._message}" if self._message else told
 
 
-class LiveServer:
+class LiveServer(ThreadingHTTPServer):
     """Serves the page and its events in threads of its own; a context that ends them.
 
     Parameters
@@ -257,29 +257,31 @@ class LiveServer:
     url : str
     """
 
+    daemon_threads = True
+    block_on_close = False
+
     def __init__(self, port: int, snapshot: Callable[[], dict[str, Any]]) -> None:
         if not 0 <= port <= 65535:
             raise ValueError(f"--port: {port}, expected 0 to 65535")
-        self._snapshot = snapshot
+        self.snapshot = snapshot
         self._readers: set[queue.Queue[bytes | None]] = set()
         self._lock = threading.Lock()
-        data = page_data([], [], 0, "")
-        self._page = page("Scan under way", _HEAD, data, live=True).encode()
+        data = page_data([], [], "")
+        self.page = page("Scan under way", _HEAD, data, live=True).encode()
         try:
-            self._server = _Server((LOOPBACK, port), _Handler)
+            super().__init__((LOOPBACK, port), _Handler)
         except OSError as error:
             raise ValueError(f"--port: {port} is taken ({error.strerror})") from error
-        self._server.live = self
-        self.url = f"http://{LOOPBACK}:{self._server.server_port}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self.url = f"http://{LOOPBACK}:{self.server_port}/"
+        self._thread = threading.Thread(target=self.serve_forever, daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+        self.shutdown()
+        self.server_close()
         with self._lock:
             for reader in self._readers:
                 with contextlib.suppress(queue.Full):  # its thread ends with the process
@@ -304,7 +306,7 @@ class LiveServer:
                     reader.get_nowait()
                     reader.put_nowait(None)
 
-    def _begin(self) -> queue.Queue[bytes | None] | None:
+    def begin(self) -> queue.Queue[bytes | None] | None:
         """Queue of one reader more, all of the run first in it; None where there are too many."""
         reader: queue.Queue[bytes | None] = queue.Queue(_WAITING)
         with self._lock:
@@ -313,19 +315,10 @@ class LiveServer:
             self._readers.add(reader)
         return reader
 
-    def _end(self, reader: queue.Queue[bytes | None]) -> None:
+    def end(self, reader: queue.Queue[bytes | None]) -> None:
+        """One reader less."""
         with self._lock:
             self._readers.discard(reader)
-
-
-def _event(name: str, data: Any) -> bytes:
-    return f"event: {name}\ndata: {as_json(data)}\n\n".encode()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-    live: LiveServer
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A reader that has gone is no error."""
@@ -333,8 +326,12 @@ class _Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
+def _event(name: str, data: Any) -> bytes:
+    return f"event: {name}\ndata: {as_json(data)}\n\n".encode()
+
+
 class _Handler(BaseHTTPRequestHandler):
-    server: _Server
+    server: LiveServer
     timeout = _WITHIN_S
     server_version, sys_version = "tactile_resonance", ""
 
@@ -343,7 +340,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._allowed():
             return
         if self.path == "/":
-            self._answer(HTTPStatus.OK, "text/html; charset=utf-8", self.server.live._page)
+            self._answer(HTTPStatus.OK, "text/html; charset=utf-8", self.server.page)
         elif self.path == "/events":
             self._events()
         else:
@@ -386,8 +383,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Security-Policy", content_security_policy(live=True))
 
     def _events(self) -> None:
-        live = self.server.live
-        reader = live._begin()
+        reader = self.server.begin()
         if reader is None:
             text = f"{MOST_READERS} pages listen already\n".encode()
             self._answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", text)
@@ -396,7 +392,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._head(HTTPStatus.OK, "text/event-stream")
             self.end_headers()
             # what is published from now on waits in the queue: nothing is missed, some may come twice
-            self.wfile.write(_event("run", live._snapshot()))
+            self.wfile.write(_event("run", self.server.snapshot()))
             while True:
                 try:
                     event = reader.get(timeout=_ALIVE_S)
@@ -408,7 +404,7 @@ class _Handler(BaseHTTPRequestHandler):
         except OSError:  # the page was closed
             return
         finally:
-            live._end(reader)
+            self.server.end(reader)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not logged."""

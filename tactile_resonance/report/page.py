@@ -303,7 +303,6 @@ def model_response(
     at_hz : (K,) float
     """
     terms = poles.structure.numerator_order - poles.structure.order + 1
-    low, high = poles.band_hz
 
     def modes(f_hz: FloatArray) -> ComplexArray:
         s = 2j * np.pi * f_hz[:, None]
@@ -311,15 +310,9 @@ def model_response(
         return np.asarray(np.sum(r / (s - p) + r.conj() / (s - p.conj()), axis=1))
 
     def rest(f_hz: FloatArray) -> FloatArray:
-        """(2 K, terms) of powers of j w: real parts, polynomials in w^2, then imaginary ones, w times such."""
-        x = (2 * f_hz**2 - low**2 - high**2) / (high**2 - low**2)
-        even, odd = (
-            np.polynomial.chebyshev.chebvander(x, n) for n in ((terms - 1) // 2, terms // 2)
-        )
-        odd = f_hz[:, None] / high * odd[:, : terms // 2]
-        return np.block(
-            [[even, np.zeros_like(odd)], [np.zeros_like(even), odd]],
-        )
+        """(2 K, terms) of powers of j w, 1 at the end of the band: their real parts, then their imaginary ones."""
+        powers = (1j * f_hz[:, None] / poles.band_hz[1]) ** np.arange(terms)
+        return np.concatenate([powers.real, powers.imag])
 
     left = g - modes(frequency_hz)
     weight = 1 / std if np.all(np.isfinite(std) & (std > 0)) else np.ones(g.size)
@@ -372,7 +365,7 @@ def _lines(lines: Lines) -> list[Any]:
 
 
 def page_data(
-    runs: Sequence[dict[str, Any]], figures: Sequence[dict[str, Any]], detailed: int, heading: str
+    runs: Sequence[dict[str, Any]], figures: Sequence[dict[str, Any]], heading: str
 ) -> dict[str, Any]:
     """All that `page.js` reads.
 
@@ -382,11 +375,10 @@ def page_data(
         Of `run_report.run_entry`.
     figures : sequence of dict
         Of `paper_figures`.
-    detailed : int
-        Points whose details are in the page.
     heading : str
         Of the figures.
     """
+    detailed = sum(len(run["details"]) for run in runs)
     measured = sum(
         sum(p["done"] for p in run["bands"][0]["points"]) for run in runs if run["bands"]
     )

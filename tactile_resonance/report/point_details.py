@@ -104,15 +104,14 @@ def details_of(run: RunContent, most: int = MOST_DETAILED) -> dict[int, PointDet
     with_tests = {tested[k] for k in evenly(len(tested), min(most, MOST_TESTED))}
     wanted = with_tests.union(result.index for result in detailed(run.latest, most))
     for result in (r for r in run.latest if r.index in wanted):
+        details = PointDetails()
         try:
-            found[result.index] = read_details(run, result)
+            details = read_details(run, result)
             if result.index in with_tests:
-                tests = fits_at(run, result)
-                found[result.index] = replace(found[result.index], tests=tests)
+                details = replace(details, tests=fits_at(run, result))
         except ValueError as error:
-            found[result.index] = replace(
-                found.get(result.index, PointDetails()), problem=str(error)
-            )
+            details = replace(details, problem=str(error))
+        found[result.index] = details
     return found
 
 

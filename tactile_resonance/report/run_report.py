@@ -21,6 +21,7 @@ from tactile_resonance.report.paper_figures import paper_figures
 from tactile_resonance.report.point_details import PointDetails, lines_each
 from tactile_resonance.report.run_tables import SURE, Truths, repeats_sentence, table_notes
 from tactile_resonance.scan.decision import Verdict
+from tactile_resonance.scan.plan_text import plan_against_outcome
 from tactile_resonance.scan.point_outcome import budget_sentence
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
@@ -85,11 +86,12 @@ def as_page(
         That was wanted.
     """
     name, scene = scene_name(run), scene_of(run)
+    plan = [] if scene is None else plan_against_outcome(scene, run)
     measured = [result for result in run.latest if result.outcome is PointOutcome.DONE]
     notes = run.facts.get("notes") or {"notes": "none"}
     facts = {key: value for key, value in run.facts.items() if key not in _SHOWN}
     sections = {
-        "Plan and outcome": tables.plan_table(scene, run),
+        "Plan and outcome": tables.text_table(("what", "planned", "came"), plan),
         "Boundary": tables.paragraphs([] if boundary is None else boundary.sentences()),
         "Sensor in free air": tables.paragraphs([_health(run, scene)[1]]),
         "Silent record": tables.bullets(silent_lines(run)),
@@ -116,7 +118,7 @@ def as_page(
         f"<h2>{html.escape(title)}</h2>{text}" for title, text in sections.items() if text
     )
     entry = run_entry(run, name, pole_maps, details, boundary)
-    data = page_data([entry], paper_figures(run, details), len(details), _FIGURES)
+    data = page_data([entry], paper_figures(run, details), _FIGURES)
     return page(name, f'{head}<div class="paper">{paper}</div>', data, below)
 
 

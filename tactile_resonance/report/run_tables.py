@@ -11,11 +11,8 @@ from typing import Any
 import numpy as np
 
 from tactile_resonance.report.point_details import PointTruth, deviation, deviations
-from tactile_resonance.scan.plan_text import plan_against_outcome
 from tactile_resonance.scan.point_outcome import time_budget
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.run_content import RunContent
-from tactile_resonance.scan.scene import ScanScene
 
 MOST_ROWS = 500
 """Of a table in a page; a browser takes seconds for ten thousand, and `results.csv` has all."""
@@ -186,13 +183,6 @@ def time_table(results: Sequence[PointResult]) -> str:
         texts = (f"{figure:.2f}" for figure in figures)
         rows.append((name, *texts, f"{100 * each.sum() / whole_s:.0f}"))
     return text_table(names, rows)
-
-
-def plan_table(scene: ScanScene | None, run: RunContent) -> str:
-    """What was planned and what came; nothing where the scene cannot be read."""
-    if scene is None:
-        return ""
-    return text_table(("what", "planned", "came"), plan_against_outcome(scene, run))
 
 
 def touches_table(surface: Mapping[str, Any] | None) -> str:
