@@ -33,17 +33,6 @@ if TYPE_CHECKING:
     from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
     from tactile_resonance.simulation.plant.tabletop import Tabletop
 
-BENCH_DEFAULTS = {
-    "table": TABLE_IN_BASE,
-    "surface_height": 0.2,
-    "tilt": 0.0,
-    "rigid_tip": False,
-    "cell": None,
-    "mount": "table",
-    "can_port": CAN_PORT,
-}
-"""Options that define what the tool touches."""
-
 BUSES: dict[str, Callable[[Reactor, int, Receiver], TcpBus]] = {
     "socketcand": SocketcandServer,
     "slcan": SlcanServer,
@@ -87,23 +76,28 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--table",
         type=float,
         nargs=6,
+        default=TABLE_IN_BASE,
         metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
         help="frame of the scene in the robot's base: metres and rotation vector",
     )
     bench.add_argument(
         "--surface-height",
         type=float,
+        default=0.2,
         metavar="M",
         help="of the tissue above the robot's base (default: 0.2)",
     )
-    bench.add_argument("--tilt", type=float, metavar="DEG", help="(default: 0)")
+    bench.add_argument("--tilt", type=float, default=0.0, metavar="DEG", help="(default: 0)")
     bench.add_argument(
         "--rigid-tip", action="store_true", help="the ball without the sensor's beam"
     )
     add_file(bench, "--cell", "load cell (default: config/load_cells/fine.yaml)")
-    bench.add_argument("--mount", choices=("table", "tool"), help="of the cell (default: table)")
-    bench.add_argument("--can-port", type=int, help="its socketcand port (default: 29536)")
-    parser.set_defaults(run=_simulate_ur, **BENCH_DEFAULTS)
+    bench.add_argument(
+        "--mount", choices=("table", "tool"), default="table", help="of the cell (default: table)"
+    )
+    port = CAN_PORT
+    bench.add_argument("--can-port", type=int, default=port, help=f"its socketcand port (default: {port})")
+    parser.set_defaults(run=_simulate_ur, default_of=parser.get_default)
     parser = commands.add_parser(
         "simulate-cell",
         help="a simulated load cell on CAN",
@@ -222,7 +216,7 @@ def _check_ur(options: argparse.Namespace) -> None:
         "table": ("scene",),
     }
     for name, others in needed.items():
-        given = getattr(options, name) != BENCH_DEFAULTS[name]
+        given = getattr(options, name) != options.default_of(name)
         if given and all(getattr(options, other) is None for other in others):
             wanted = " or ".join(f"--{other}" for other in others)
             raise ValueError(f"{_option(name)}: serves only with {wanted}")

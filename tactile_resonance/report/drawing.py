@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the figures share: decibels, ellipses, saving, the mark on simulated results."""
+"""What the figures share: ellipses, saving, the mark on simulated results."""
 
 from __future__ import annotations
 
@@ -39,12 +39,6 @@ def figure_bytes(figure: Figure, suffix: str) -> bytes:
 def save_figure(figure: Figure, path: Path) -> None:
     """Write the figure, whole or not at all."""
     write_whole(path, figure_bytes(figure, path.suffix))
-
-
-def decibel(power: npt.ArrayLike) -> FloatArray:
-    """10 log10 of a power; NaN where it is not positive."""
-    power = np.asarray(power, float)
-    return 10 * np.log10(np.where(power > 0, power, np.nan))
 
 
 def draw_ellipse(

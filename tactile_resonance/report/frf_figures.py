@@ -17,9 +17,9 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.analysis import Analysis
 from tactile_resonance.calibration.fit import Fitted
 from tactile_resonance.calibration.records import Load
-from tactile_resonance.frf.distortion import DetectionLines, Distortion
+from tactile_resonance.frf.distortion import DetectionLines, Distortion, decibel
 from tactile_resonance.frf.variance_analysis import VarianceAnalysis
-from tactile_resonance.report.drawing import decibel, draw_ellipse, new_figure
+from tactile_resonance.report.drawing import draw_ellipse, new_figure
 
 
 def draw_analysis(analysis: Analysis, title: str) -> Figure:

@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.frf.distortion import DetectionLines, estimate_distortion
+from tactile_resonance.frf.distortion import DetectionLines, decibel, estimate_distortion
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.result import ellipse
 from tactile_resonance.recording.messages import array_of, complex_of
 from tactile_resonance.recording.recording import Recording
 from tactile_resonance.recording.store import recording_of
-from tactile_resonance.report.drawing import PROBABILITY, decibel
+from tactile_resonance.report.drawing import PROBABILITY
 from tactile_resonance.report.page import evenly, listed, s_plane
 from tactile_resonance.report.point_details import FRF_TYPE, PointDetails
 from tactile_resonance.scan.point_file import read_messages

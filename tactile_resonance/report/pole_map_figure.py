@@ -36,8 +36,6 @@ def draw_pole_map(pole_map: PoleMap, title: str, boundary: RunBoundary | None = 
     boundary : RunBoundary, optional
         Drawn with its band, and its truth where that is known.
     """
-    if not pole_map.points:
-        raise ValueError("pole_map: got no points; accepted is one or more")
     figure = new_figure(16, 6.2)
     figure.suptitle(title + (f" ({SIMULATED})" if pole_map.simulated else ""))
     above, unsure, plane = figure.subplots(1, 3, width_ratios=(1.1, 1.1, 1))
