@@ -14,8 +14,6 @@ stands.
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
@@ -73,7 +71,6 @@ def _own(values: ArrayLike) -> FloatArray:
     return np.array(values, float, order="C")
 
 
-@cache
 def compiled() -> int:
     """How many kernels were not in the cache and had to be compiled: some five seconds, once."""
     nodes = np.arange(3.0)

@@ -235,7 +235,8 @@ def _result(
     beyond = None
     if further is not None:
         std = np.hypot(std, _moved(best, further))
-        beyond = _series(further)
+        einf, *rest = np.exp(further.x[: 2 * further.terms + 1])
+        beyond = Prony(float(einf), *np.split(np.array(rest), 2))
     values = np.exp(best.x[: 2 * n + 1])
     hold_s = max(means.hold_s, means.ramp_s)
     terms = []
@@ -296,11 +297,6 @@ def _known(
     if time_s >= middle_s and time_s * np.exp(SURE * time_std) > hold_s / SHOWN:
         return Known.SLOWER
     return Known.UNCERTAIN if max(modulus_std, time_std) > LARGEST_STD else Known.DETERMINED
-
-
-def _series(solution: SeriesSolution) -> Prony:
-    values = np.exp(solution.x[: 2 * solution.terms + 1])
-    return Prony(float(values[0]), *np.split(values[1:], 2))
 
 
 def _moved(best: SeriesSolution, further: SeriesSolution) -> FloatArray:

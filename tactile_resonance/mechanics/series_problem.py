@@ -107,13 +107,9 @@ class SeriesProblem:
             for time in np.log(np.geomspace(*self._tried_s, INSERTED))
         ]
         for j in range(n):
-            halves = np.insert(moduli - np.log(2) * (np.arange(n) == j), j, moduli[j] - np.log(2))
-            made.append(
-                (
-                    halves,
-                    np.insert(times + np.log(2) * (np.arange(n) == j), j, times[j] - np.log(2)),
-                )
-            )
+            twice = np.log(2) * (np.arange(n) == j)
+            first, later = moduli[j] - np.log(2), times[j] - np.log(2)
+            made.append((np.insert(moduli - twice, j, first), np.insert(times + twice, j, later)))
         made.sort(key=lambda one: self._linear(np.exp(one[1]), x[-3])[1])
         return [np.concatenate([x[:1], *one, x[-4:]]) for one in made[:STARTS]]
 
