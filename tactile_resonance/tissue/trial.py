@@ -58,39 +58,28 @@ class Trial:
         """Those points alone."""
         return Trial(*(getattr(self, item.name)[chosen] for item in fields(self)))
 
-    def share(self, which: BoolArray) -> Share:
-        """How many of the points are `which` (n,)."""
-        groups = np.unique(self.preparation).size
-        return Share(int(np.sum(which)), len(which), groups)
+    def share(self, which: BoolArray) -> str:
+        """How many of the points are `which` (n,), with the limits of that share."""
+        count, of = int(np.sum(which)), len(which)
+        low, high = share_limits(count, of, np.unique(self.preparation).size)
+        share = f"{count / of:.2%}" if of else "-"
+        return f"{count} of {of} ({share}, {low:.2%} to {high:.2%})"
 
 
-@dataclass(frozen=True)
-class Share:
-    """Points out of points, which come from so many independent groups."""
+def share_limits(
+    count: int, of: int, groups: int, confidence: float = 0.95
+) -> tuple[float, float]:
+    """Clopper and Pearson's interval of points out of points, as if each independent group had been counted once.
 
-    count: int
-    of: int
-    groups: int
-
-    def limits(self, confidence: float = 0.95) -> tuple[float, float]:
-        """Clopper and Pearson's interval, as if each group had been counted once.
-
-        That is right where points of a group share their fate, and wide where they do not.
-        """
-        if not self.of:
-            return 0.0, 1.0
-        scaled = self.count * self.groups / self.of
-        low, high = (1 - confidence) / 2, (1 + confidence) / 2
-        first = stats.beta.ppf(low, scaled, self.groups - scaled + 1) if scaled > 0 else 0.0
-        second = (
-            stats.beta.ppf(high, scaled + 1, self.groups - scaled) if self.count < self.of else 1.0
-        )
-        return float(first), float(second)
-
-    def __str__(self) -> str:
-        low, high = self.limits()
-        share = f"{self.count / self.of:.2%}" if self.of else "-"
-        return f"{self.count} of {self.of} ({share}, {low:.2%} to {high:.2%})"
+    That is right where points of a group share their fate, and wide where they do not.
+    """
+    if not of:
+        return 0.0, 1.0
+    scaled = count * groups / of
+    low, high = (1 - confidence) / 2, (1 + confidence) / 2
+    first = stats.beta.ppf(low, scaled, groups - scaled + 1) if scaled > 0 else 0.0
+    second = stats.beta.ppf(high, scaled + 1, groups - scaled) if count < of else 1.0
+    return float(first), float(second)
 
 
 @dataclass(frozen=True)

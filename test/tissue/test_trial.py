@@ -17,7 +17,7 @@ from tactile_resonance.tissue.references import (
     read_sources,
 )
 from tactile_resonance.tissue.spread import spreads_of
-from tactile_resonance.tissue.trial import Share, Trial, call_points, leave_out, reliability
+from tactile_resonance.tissue.trial import Trial, call_points, leave_out, reliability, share_limits
 
 STEP = np.array([2.5, 2.5e-3])  # 2 % w/w
 TWO_GELATINES = Path("config/scenes/two_gelatines.yaml")
@@ -80,12 +80,12 @@ def test_a_tissue_outside_of_the_library_is_called_unknown():
 
 
 def test_shares_count_groups_that_share_their_fate_once():
-    assert Share(0, 100, 10).limits() == Share(0, 10, 10).limits()
-    low, high = Share(3, 60, 60).limits()
+    assert share_limits(0, 100, 10) == share_limits(0, 10, 10)
+    low, high = share_limits(3, 60, 60)
     exact = stats.binomtest(3, 60).proportion_ci(0.95)
     assert (low, high) == pytest.approx((exact.low, exact.high))
-    assert Share(60, 60, 60).limits()[1] == 1.0
-    assert Share(0, 0, 0).limits() == (0.0, 1.0)
+    assert share_limits(60, 60, 60)[1] == 1.0
+    assert share_limits(0, 0, 0) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("preparations", [3, 12])
