@@ -135,8 +135,7 @@ def _draw(plan: Plan) -> Figure:
     from tactile_resonance.report.drawing import new_figure
     from tactile_resonance.scan.measurement import excitation_of
 
-    figure = new_figure(13, 5)
-    figure.suptitle(f"plan of {plan.scene.name}")
+    figure = new_figure(13, 5, f"plan of {plan.scene.name}")
     above, lines = figure.subplots(1, 2)
     x_mm, y_mm = ([1e3 * point.position_m[k] for point in plan.first_points] for k in range(2))
     title = counted(len(plan.points), "point")

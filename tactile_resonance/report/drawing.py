@@ -22,10 +22,12 @@ PROBABILITY = 0.95
 """With which an ellipse holds the truth."""
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
+def new_figure(width_in: float, height_in: float, title: str | None = None) -> Figure:
     """Figure that never opens a window."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
+    if title is not None:
+        figure.suptitle(title)
     return figure
 
 

@@ -25,8 +25,7 @@ from tactile_resonance.report.drawing import draw_ellipse, new_figure
 def draw_analysis(analysis: Analysis, title: str) -> Figure:
     """FRF with its standard deviation, the band with the model, the pole with its ellipse."""
     frf, poles = analysis.frf, analysis.poles
-    figure = new_figure(12, 7.5)
-    figure.suptitle(title)
+    figure = new_figure(12, 7.5, title)
     axes = figure.subplot_mosaic([["whole", "whole", "poles"], ["band", "phase", "poles"]])
 
     whole = axes["whole"]
@@ -78,8 +77,7 @@ def draw_analysis(analysis: Analysis, title: str) -> Figure:
 def draw_calibration(fitted: Fitted, title: str) -> Figure:
     """A column of each record: response and residual over frequency, residuals in their standard deviations."""
     records = fitted.records
-    figure = new_figure(4.2 * len(records), 7.5)
-    figure.suptitle(title)
+    figure = new_figure(4.2 * len(records), 7.5, title)
     axes = figure.subplots(2, len(records), squeeze=False, sharex=True)
     for column, (record, residual) in enumerate(zip(records, fitted.residuals, strict=True)):
         frf, std = record.frf, np.sqrt(record.variance)
@@ -110,8 +108,7 @@ def draw_distortion(cases: Mapping[str, Distortion], title: str) -> Figure:
     """One panel a case: linear output, even and odd distortion of the output, noise, over frequency."""
     columns = min(2, len(cases))
     rows = -(-len(cases) // columns)
-    figure = new_figure(7.5 * columns, 4.5 * rows)
-    figure.suptitle(title)
+    figure = new_figure(7.5 * columns, 4.5 * rows, title)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes, (name, distortion) in zip(panels.flat, cases.items(), strict=False):
         _draw_case(axes, distortion)

@@ -36,8 +36,7 @@ def draw_pole_map(pole_map: PoleMap, title: str, boundary: RunBoundary | None = 
     boundary : RunBoundary, optional
         Drawn with its band, and its truth where that is known.
     """
-    figure = new_figure(16, 6.2)
-    figure.suptitle(title + (f" ({SIMULATED})" if pole_map.simulated else ""))
+    figure = new_figure(16, 6.2, title + (f" ({SIMULATED})" if pole_map.simulated else ""))
     above, unsure, plane = figure.subplots(1, 3, width_ratios=(1.1, 1.1, 1))
     if not pole_map.estimated:
         _draw_failures(above, pole_map)

@@ -25,8 +25,7 @@ from tactile_resonance.simulation.tissue.scene import PhantomScene, Sphere
 
 def draw_tissues(bench: SimulatedBench, library: TissueLibrary, names: Sequence[str]) -> Figure:
     """Mode shapes, frequency response in air and on tissues, and the poles of one mode."""
-    figure = new_figure(17, 9)
-    figure.suptitle(f"The bimorph in air and on tissue at 1 cN ({SIMULATED})")
+    figure = new_figure(17, 9, f"The bimorph in air and on tissue at 1 cN ({SIMULATED})")
     shapes, whole, zoom, plane = figure.subplots(2, 2).ravel()
     modes = sensor_modes(bench.sensor)
     x = np.linspace(0, 1, 400)
@@ -63,8 +62,7 @@ def draw_tissues(bench: SimulatedBench, library: TissueLibrary, names: Sequence[
 
 def draw_indentation(bench: SimulatedBench, library: TissueLibrary, names: Sequence[str]) -> Figure:
     """Force over depth in and out, relaxation of the force, adhesion, and the tip on the beam."""
-    figure = new_figure(17, 9)
-    figure.suptitle(f"A ball of 5 mm pressed into tissue ({SIMULATED})")
+    figure = new_figure(17, 9, f"A ball of 5 mm pressed into tissue ({SIMULATED})")
     cycle, relaxation, adhesion, sprung = figure.subplots(2, 2).ravel()
     for k, name in enumerate(names):
         tissue, colour = library[name], f"C{k}"
@@ -154,8 +152,7 @@ def draw_scene(bench: SimulatedBench, scene: PhantomScene, points: np.ndarray) -
     def over(value: Callable[[Any], float]) -> np.ndarray:
         return np.array([np.nan if at is None else value(at) for at in felt.flat]).reshape(felt.shape)
 
-    figure = new_figure(17, 5.5)
-    figure.suptitle(f"What the tip feels over the scene '{scene.name}' ({SIMULATED})")
+    figure = new_figure(17, 5.5, f"What the tip feels over the scene '{scene.name}' ({SIMULATED})")
     panels = (
         ("E(1 s) felt [kPa]", over(lambda at: at.contact.tissue.relaxation_modulus_1s_pa / 1e3)),
         ("f0 [Hz]", over(lambda at: at.mode_near(250.0).f0_hz)),
@@ -177,8 +174,7 @@ def draw_scene(bench: SimulatedBench, scene: PhantomScene, points: np.ndarray) -
 
 def draw_creep(bench: SimulatedBench, library: TissueLibrary, names: Sequence[str]) -> Figure:
     """Force, contact radius and pole while force or depth are held."""
-    figure = new_figure(17, 5.5)
-    figure.suptitle(f"A contact from 1 s on: force held (full), depth held (dotted) ({SIMULATED})")
+    figure = new_figure(17, 5.5, f"A contact from 1 s on: force held (full), depth held (dotted) ({SIMULATED})")
     force_axes, radius_axes, pole_axes = figure.subplots(1, 3)
     time = np.linspace(1, 10, 40)
     ramp = np.concatenate([np.linspace(0, 0.2, 101)[1:], np.linspace(0.21, 10, 980)])

@@ -33,9 +33,8 @@ def draw_references(
     simulated: bool,
 ) -> Figure:
     """All four panels."""
-    figure = new_figure(13, 9)
+    figure = new_figure(13, 9, "References" + (f", {SIMULATED}" if simulated else ""))
     (poles, sources), (calls, step) = figure.subplots(2, 2)
-    figure.suptitle("References" + (f", {SIMULATED}" if simulated else ""))
     draw_poles(poles, points, spreads)
     _draw_sources(sources, spreads)
     draw_reliability(calls, bins)
@@ -140,9 +139,8 @@ def draw_comparison(
     simulated: bool,
 ) -> Figure:
     """Places (n, 2) [m], poles (n, 2) of covariances (n, 2, 2), and the criterion over the number of groups."""
-    figure = new_figure(15, 5)
+    figure = new_figure(15, 5, "What differs" + (f", {SIMULATED}" if simulated else ""))
     places, poles, criterion = figure.subplots(1, 3, width_ratios=(2, 2, 1))
-    figure.suptitle("What differs" + (f", {SIMULATED}" if simulated else ""))
     of_point, differs = groups.of_point, found.differs
     for k in range(len(groups.mean)):
         own = of_point == k
@@ -193,9 +191,8 @@ def draw_tests(tests: Sequence[TissueTest], title: str) -> Figure:
     shown = [one for one in tests if one.fit is not None]
     if not shown:
         raise ValueError("tests: none could be fitted; accepted is at least one, to be drawn")
-    figure = new_figure(13, 5.5)
     any_simulated = any(one.test.simulated for one in shown)
-    figure.suptitle(f"{title} ({SIMULATED})" if any_simulated else title)
+    figure = new_figure(13, 5.5, f"{title} ({SIMULATED})" if any_simulated else title)
     over_time, over_depth = figure.subplots(1, 2)
     creep = all(one.test.protocol is Protocol.CREEP for one in shown)
     for k, one in enumerate(shown):
