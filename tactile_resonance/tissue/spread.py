@@ -223,11 +223,7 @@ def _sources(
 ) -> tuple[FloatArray, tuple[SpreadSource, ...], FloatArray]:
     """Mean squares (L, 2, 2), sources, and by how much of each mean square each source is made of (L, L)."""
     count = len(found.levels)
-    squares, spread, parts = (
-        np.zeros((count, 2, 2)),
-        np.zeros((count, 2, 2)),
-        np.zeros((count,) * 2),
-    )
+    (squares, spread), parts = np.zeros((2, count, 2, 2)), np.zeros((count, count))
     sources: list[SpreadSource] = []
     held: list[str] = []
     for i in reversed(range(count)):
