@@ -25,7 +25,7 @@ from tactile_resonance.scan.map_messages import (
 )
 from tactile_resonance.scan.messages import header_message, make_message, to_cdr
 from tactile_resonance.scan.point_file import PointFileWriter, offered_qos, read_messages
-from tactile_resonance.scan.pole_map import GrowingMap, PoleMap, counts
+from tactile_resonance.scan.pole_map import GrowingMap, counts
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.tissue.classify import UNKNOWN
 
@@ -74,35 +74,24 @@ def write_map_recording(run: RunContent) -> Path | None:
         for done, result in enumerate(results, start=1):
             grown.take(result)
             latest[result.index] = result
-            if (len(results) - done) % step == 0:  # the last one is among them
-                header, beside = header_message(frame_id, result.time_ns), []
-                if adaptive is not None:
-                    boundary = adaptive.boundary(latest.values())
-                    beside = boundary_markers(grown.map, boundary, header)
-                _write_map(writer, result.time_ns, grown.map, header, names, beside)
+            if (len(results) - done) % step:  # the last one is drawn
+                continue
+            shown, header, beside = grown.map, header_message(frame_id, result.time_ns), []
+            if adaptive is not None:
+                beside = boundary_markers(shown, adaptive.boundary(latest.values()), header)
+            scale = shown.ellipse_scale(_PROBABILITY)
+            for name, message in {
+                "": cloud_message(shown, names, header),
+                "/markers": marker_message(shown, scale, _PROBABILITY, header, beside),
+                "/legend": legend_message(shown, scale, _PROBABILITY, names, header),
+            }.items():
+                _write(writer, f"/pole_map{name}", result.time_ns, message, _LATCHED)
         ended_ns = results[-1].time_ns
         surface = surface_message(last, _CELLS, header_message(frame_id, ended_ns))
         _write(writer, "/pole_map/surface", ended_ns, surface, _LATCHED)
         writer.finish()
         os.replace(Path(hidden) / FILE, run.path / FILE)
     return run.path / FILE
-
-
-def _write_map(
-    writer: PointFileWriter,
-    time_ns: int,
-    pole_map: PoleMap,
-    header: Any,
-    names: tuple[str, ...],
-    beside: Sequence[Any],
-) -> None:
-    scale = pole_map.ellipse_scale(_PROBABILITY)
-    for name, message in {
-        "": cloud_message(pole_map, names, header),
-        "/markers": marker_message(pole_map, scale, _PROBABILITY, header, beside),
-        "/legend": legend_message(pole_map, scale, _PROBABILITY, names, header),
-    }.items():
-        _write(writer, f"/pole_map{name}", time_ns, message, _LATCHED)
 
 
 def _write_frames(writer: PointFileWriter, run: RunContent) -> str:

@@ -310,7 +310,7 @@ def model_response(
         return np.asarray(np.sum(r / (s - p) + r.conj() / (s - p.conj()), axis=1))
 
     def rest(f_hz: FloatArray) -> FloatArray:
-        """(2 K, terms) of powers of j w, 1 at the end of the band: their real parts, then their imaginary ones."""
+        """(2 K, terms) of powers of j w, 1 at the end of the band: real parts, then imaginary ones."""
         powers = (1j * f_hz[:, None] / poles.band_hz[1]) ** np.arange(terms)
         return np.concatenate([powers.real, powers.imag])
 

@@ -69,7 +69,7 @@ class Trial:
 def share_limits(
     count: int, of: int, groups: int, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Clopper and Pearson's interval of points out of points, as if each independent group had been counted once.
+    """Clopper and Pearson's interval of points out of points, as if each group had been counted once.
 
     That is right where points of a group share their fate, and wide where they do not.
     """
