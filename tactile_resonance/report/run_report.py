@@ -187,6 +187,7 @@ def warnings_of(
     if health is not SensorHealth.STEADY:
         told.append(sentence)
     measured = [r for r in results if r.outcome is PointOutcome.DONE]
+    hopeless = [r for r in measured if r.verdict == Verdict.HOPELESS.value]
     off: list[PointResult] = []
     if scene is not None:
         off = [r for r in measured if _force_is_off(r, scene.force_n)]
@@ -198,7 +199,7 @@ def warnings_of(
             [r for r in measured if r.poles_status not in SURE],
             lambda r: r.poles_status,
         ),
-        ("precision out of reach", _out_of_reach(measured), lambda r: f"{counted(r.blocks, 'block')}"),
+        ("precision out of reach", hopeless, lambda r: f"{counted(r.blocks, 'block')}"),
         ("force other than the scene's", off, lambda r: f"{1e3 * r.force_n:.2f} mN"),
         ("force not quiet at first", [r for r in measured if r.gate], lambda r: r.gate),
         (
@@ -247,10 +248,6 @@ def _not_tested(
     return why
 
 
-def _out_of_reach(results: Sequence[PointResult]) -> list[PointResult]:
-    return [result for result in results if result.verdict == Verdict.HOPELESS.value]
-
-
 def _force_is_off(result: PointResult, force_n: float) -> bool:
     """Whether the mean force differs from the scene's beyond its noise and by more than a share of it."""
     off_n = abs(result.force_n - force_n)
@@ -279,8 +276,8 @@ def summary(run: RunContent) -> list[str]:
             f"{counted(blocks, 'block')} measured; {saved} more were allowed and not taken, "
             f"{seconds:.1f} s saved."
         )
-    if given_up := _out_of_reach(run.latest):
-        lines.append(f"Precision out of reach at {counted(len(given_up), 'point')}, which ended early.")
+    if given_up := sum(r.verdict == Verdict.HOPELESS.value for r in run.latest):
+        lines.append(f"Precision out of reach at {counted(given_up, 'point')}, which ended early.")
     if time := budget_sentence(run.latest):
         lines.append(time)
     classes = Counter(r.tissue_class for r in run.latest if r.tissue_class)
