@@ -205,7 +205,7 @@ class Moduli:
     Attributes
     ----------
     storage_pa, storage_std_pa, loss_pa, loss_std_pa : float
-        Of the modulus at the mode, radiation taken off; NaN where there is no radius.
+        Of the modulus at the mode, radiation taken off; NaN where there is no radius, or one above the ball's.
     contact_radius_m : float
     radius_ratio : float
         Over the ball's.
@@ -262,6 +262,9 @@ def moduli(estimate: TissueContact, relaxed_ratio: float = 1.0) -> Moduli:
     plane = found[0] / relaxed_ratio / (1 - POISSON_RATIO**2)
     radius = float((0.75 * prior.force_n * radius_of_tip / plane) ** (1 / 3))
     ratio = radius / radius_of_tip
+    if not ratio <= 1:
+        why = f"contact radius {ratio:.3g} of the ball's, which no ball has, hence no modulus"
+        return Moduli(ContactStatus.BEYOND_HERTZ, why)
     status, message = ContactStatus.OK, ""
     if not ratio <= STRICT_HERTZ:
         status = ContactStatus.BEYOND_HERTZ

@@ -245,6 +245,16 @@ def test_moduli_within_strict_hertz_and_beyond_it(bench, given, library):
     assert "strict Hertz" in found.message
 
 
+def test_a_radius_above_that_of_the_ball_gives_no_modulus(known, bench, library):
+    """As where a record is of another sensor, or the force of another unit: 1 N in place of 10 mN."""
+    found = known(played(bench, contact_of(bench, library["cortex"]), seed=2, skew_s=SKEW_S), FORCE_N)
+    pressed = replace(found, prior=replace(found.prior, force_n=100 * FORCE_N))
+    result = moduli(pressed)
+    assert result.status is ContactStatus.BEYOND_HERTZ
+    assert "no modulus" in result.message
+    assert np.isnan([result.storage_pa, result.loss_pa, result.contact_radius_m]).all()
+
+
 def test_without_a_force_there_is_no_modulus(known, bench, library):
     contact = contact_of(bench, library["gel12"])
     found = known(played(bench, contact, seed=2, skew_s=SKEW_S))
