@@ -179,11 +179,14 @@ class SensorModel:
         denominator, slope = self._denominators(poles)
         a, b, c = self._sums(1 / denominator)
         da, db, dc = self._sums(-slope / denominator**2)
-        k, dk = contact.at(poles), contact.slope(poles)
-        loop = 1 + k * c
-        dx = da - (2 * k * b * db + dk * b**2) / loop + k * b**2 * (dk * c + k * dc) / loop**2
         gamma, leak = (np.asarray(getattr(self, name))[..., None] for name in SINGLE[:2])
-        return (gamma - 1 - leak / poles) / (dx - leak / poles**2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            k, dk = contact.at(poles), contact.slope(poles)
+            loop = 1 + k * c
+            dx = da - (2 * k * b * db + dk * b**2) / loop + k * b**2 * (dk * c + k * dc) / loop**2
+            residues = (gamma - 1 - leak / poles) / (dx - leak / poles**2)
+        # at -1 / tau_j there is nothing: the relaxation is too small to move its own pole
+        return np.where(np.isfinite(k), residues, 0.0)
 
     def _denominators(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """(..., S, n) D_i at s (..., S), and their slopes."""

@@ -64,3 +64,12 @@ def test_parameters_in_one_array_and_back_also_stacked(bench):
     for one, found in zip(values, both, strict=True):
         alone = SensorModel.of_values(one).poles(contact)
         np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(alone), rtol=1e-10)
+
+
+def test_a_relaxation_of_nothing_changes_no_residue(bench):
+    """Its pole -1 / tau cancels: there k is not finite, and the residue 0."""
+    model, times_s = true_sensor(bench), np.array([1e-3])
+    plain, none = ContactStiffness(50.0), ContactStiffness(50.0, np.zeros(1), times_s)
+    poles = np.append(model.poles(plain), -1 / times_s)
+    expected = np.append(model.residues(poles[:-1], plain), 0.0)
+    np.testing.assert_allclose(model.residues(poles, none), expected, rtol=1e-12)
