@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -31,36 +32,28 @@ MOST_SEARCH_M = 0.02
 _INSIDE = 1e-9  # of the barycentric coordinates: points on a shared edge belong to both triangles
 
 
-class Surface(Protocol):
+class Surface(ABC):
     """A surface seen from above: one height for each x, y. NaN where there is none."""
 
+    @abstractmethod
     def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) height [m] at (..., 2) positions [m]."""
-        ...
 
+    @abstractmethod
     def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(..., 3) outward (upward) unit normal at (..., 2) positions [m]."""
-        ...
 
     def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) standard deviation of the height [m]; 0 where the surface is given."""
-        ...
+        return np.zeros(np.shape(xy_m)[:-1])
 
     def known(self, xy_m: npt.ArrayLike) -> BoolArray:
         """(...) whether the surface is known there, not only continued from beside it."""
-        ...
-
-
-class ExactSurface:
-    """A surface that is given, not estimated."""
-
-    def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(...) zeros."""
-        return np.zeros(np.shape(xy_m)[:-1])
+        return ~np.isnan(self.height_m(xy_m))
 
 
 @dataclass(frozen=True)
-class Plane(ExactSurface):
+class Plane(Surface):
     """A plane through a point [m]; its normal points upwards and need not be of length 1."""
 
     point_m: Vector = (0.0, 0.0, 0.0)
@@ -81,13 +74,9 @@ class Plane(ExactSurface):
         unit = np.asarray(self.normal_) / np.linalg.norm(self.normal_)
         return np.broadcast_to(unit, (*np.shape(xy_m)[:-1], 3)).copy()
 
-    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
-        """(...) everywhere."""
-        return np.ones(np.shape(xy_m)[:-1], dtype=bool)
-
 
 @dataclass(frozen=True, eq=False)
-class HeightField(ExactSurface):
+class HeightField(Surface):
     """Heights on a rectangular grid, joined by a bicubic spline (of lower order on small grids).
 
     Attributes
@@ -120,11 +109,6 @@ class HeightField(ExactSurface):
         """(..., 3) unit normal, NaN outside of the grid."""
         return unit_normal(self._evaluate(xy_m, dx=1), self._evaluate(xy_m, dy=1))
 
-    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
-        """(...) inside of the grid."""
-        x, y = np.moveaxis(np.asarray(xy_m, float), -1, 0)
-        return (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
-
     @cached_property
     def _spline(self) -> RectBivariateSpline:
         orders = [min(3, axis.size - 1) for axis in (self.x_m, self.y_m)]
@@ -132,7 +116,8 @@ class HeightField(ExactSurface):
 
     def _evaluate(self, xy_m: npt.ArrayLike, dx: int = 0, dy: int = 0) -> FloatArray:
         x, y = np.moveaxis(np.asarray(xy_m, float), -1, 0)
-        inside = self.known(xy_m)
+        inside = (x >= self.x_m[0]) & (x <= self.x_m[-1])
+        inside &= (y >= self.y_m[0]) & (y <= self.y_m[-1])
         value = self._spline.ev(np.where(inside, x, self.x_m[0]), y, dx=dx, dy=dy)
         return np.where(inside, value, np.nan)
 
@@ -144,7 +129,7 @@ def unit_normal(slope_x: npt.ArrayLike, slope_y: npt.ArrayLike) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class TriangleMesh(ExactSurface):
+class TriangleMesh(Surface):
     """A mesh seen from above; its topmost face counts.
 
     Normals are those of the corners, interpolated over each triangle, so that a finely meshed organ is
@@ -203,10 +188,6 @@ class TriangleMesh(ExactSurface):
     def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(..., 3) upward unit normal, NaN beside the mesh."""
         return self._over(xy_m)[1]
-
-    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
-        """(...) over the mesh."""
-        return ~np.isnan(self.height_m(xy_m))
 
     def _over(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Height (...) and normal (..., 3)."""
@@ -307,7 +288,7 @@ class TouchRequest:
         require(given >= least, "points_m", given, f"{least} positions or more for a {self.form}")
         check_above_zero(self, "force_n")
         require(self.tolerance_m > 0, "tolerance_m", self.tolerance_m, "a number above 0")
-        check_search(self.search_m, "search_m")
+        check_within(self, search_m=(0.0, MOST_SEARCH_M))
 
 
 @dataclass(frozen=True)
@@ -399,9 +380,3 @@ _FORMS = {
     "mesh": _Mesh,
     "touch": TouchRequest,
 }
-
-
-def check_search(search_m: float, field: str) -> None:
-    """``ValueError`` where a search is not from 0 to `MOST_SEARCH_M`."""
-    accepted = f"a number from 0 to {MOST_SEARCH_M:g} [m]"
-    require(0 <= search_m <= MOST_SEARCH_M, field, search_m, accepted)

@@ -16,7 +16,7 @@ from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.scan.hands import PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.points import ScanPoint, tip_orientation
-from tactile_resonance.scan.surface import TouchRequest, unit_normal
+from tactile_resonance.scan.surface import Surface, TouchRequest, unit_normal
 
 UP = (0.0, 0.0, 1.0)
 FORMS = {"plane": 3, "quadric": 6}
@@ -32,7 +32,7 @@ SEARCH_STEP_M = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class TouchedSurface:
+class TouchedSurface(Surface):
     """A polynomial surface fitted to contacts.
 
     Attributes

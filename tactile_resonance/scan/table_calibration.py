@@ -31,7 +31,7 @@ from tactile_resonance.fields import (
 from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.scene import SensorUse
-from tactile_resonance.scan.surface import TouchRequest, check_search
+from tactile_resonance.scan.surface import MOST_SEARCH_M, TouchRequest
 from tactile_resonance.scan.surface_search import (
     LEAST_TOUCH_STD_M,
     TouchedSurface,
@@ -71,8 +71,8 @@ class CalibrationRequest:
         except ValueError as error:
             raise ValueError(f"sensor: {error}") from error
         check_above_zero(self, "force_n")
-        check_search(self.search_m, "search_m")
-        check_within(self, flatness_m=(0.0, 1e-3), most_tilt_rad=(1e-6, 0.2))
+        ranges = {"search_m": (0.0, MOST_SEARCH_M), "flatness_m": (0.0, 1e-3)}
+        check_within(self, **ranges, most_tilt_rad=(1e-6, 0.2))
         number(self.heading_rad, "heading_rad")
         require(len(self.points_m) >= 3, "points", len(self.points_m), "three points or more")
         for index, point in enumerate(self.points_m):
