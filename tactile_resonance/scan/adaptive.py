@@ -229,15 +229,16 @@ class Adaptive:
 
         By the likeliest length and size alone: to choose, that does, and costs a tenth.
         """
-        surface = surface.likeliest
+        process = surface.likeliest
         at = self._coarse.xy_m[self._coarse.within]
-        f0_hz, std_hz = surface.predict(at)
+        f0_hz, variance = process.moments(at)
+        std_hz = np.sqrt(variance)
         before = self.wanted.loss(f0_hz, std_hz)
         open_ = before > _OPEN * before.max()
         f0, std = f0_hz[open_, None], std_hz[open_, None]
-        _, std_there = surface.predict(places_m[free])
-        shared = surface.covariance(at[open_], places_m[free])  # (o, f)
-        known = shared**2 / (std_there**2 + noise_hz**2)
+        _, there = process.moments(places_m[free])
+        shared = process.covariance(at[open_], places_m[free])  # (o, f)
+        known = shared**2 / (there + noise_hz**2)
         after = np.sqrt(np.maximum(std**2 - known, 0))
         return np.asarray(
             np.sum(before[open_, None] - self.wanted.loss_after(f0, std, after), axis=0)

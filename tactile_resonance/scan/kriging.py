@@ -10,7 +10,7 @@ Stein, Technometrics 35, 1993).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +40,7 @@ _LENGTH_STEP, _SIZE_STEPS, _LEAST_SHARE = 0.7, (-1.3, 0, 1.3, 2.6), 0.1
 _JITTER = 1e-10
 
 
-class _Process(NamedTuple):
+class Process(NamedTuple):
     """A process of one length and size, with the points known.
 
     Attributes
@@ -70,7 +70,7 @@ class _Process(NamedTuple):
     @classmethod
     def of(
         cls, xy_m: FloatArray, y: FloatArray, noise: FloatArray, length_m: float, std: float
-    ) -> _Process:
+    ) -> Process:
         """Of values (n,) with noise."""
         covariance = std**2 * _matern(cdist(xy_m, xy_m) / length_m)
         lower = np.asarray(cholesky(covariance + np.diag(noise**2 + _JITTER * std**2), lower=True), np.float64)
@@ -93,6 +93,17 @@ class _Process(NamedTuple):
         solved = _solved(self.lower, cross)
         return self.mean + self.weights @ cross, solved, self.mean_std - self.of_mean @ solved
 
+    def moments(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(q,) value and its variance at (q, 2) positions."""
+        value, solved, of_mean = self.at(at_m)
+        known = np.einsum("nq,nq->q", solved, solved)
+        return value, np.maximum(self.std**2 - known + of_mean**2, 0)
+
+    def covariance(self, a_m: FloatArray, b_m: FloatArray) -> FloatArray:
+        """(p, q) covariance of the quantity between (p, 2) and (q, 2) positions, as `moments` knows it."""
+        (_, solved_a, of_a), (_, solved_b, of_b) = self.at(a_m), self.at(b_m)
+        return self.before(a_m, b_m) - solved_a.T @ solved_b + np.outer(of_a, of_b)
+
 
 @dataclass(frozen=True, eq=False)
 class KrigedSurface:
@@ -100,29 +111,19 @@ class KrigedSurface:
 
     Attributes
     ----------
-    xy_m : (n, 2) float
-        Points measured.
-    length_m : float
-        Distance over which the quantity changes: of greatest likelihood.
-    process_std : float
-        How much it varies: as well.
     processes : tuple of k
         Of lengths and sizes that the points allow; one where many points determine these.
     shares : (k,) float
         Their probabilities.
     """
 
-    xy_m: FloatArray
-    length_m: float
-    process_std: float
-    processes: tuple[_Process, ...]
+    processes: tuple[Process, ...]
     shares: FloatArray
 
     @property
-    def likeliest(self) -> KrigedSurface:
-        """By the process of the largest share alone."""
-        best = self.processes[int(np.argmax(self.shares))]
-        return replace(self, processes=(best,), shares=np.ones(1))
+    def likeliest(self) -> Process:
+        """The process of the largest share."""
+        return self.processes[int(np.argmax(self.shares))]
 
     def predict(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(...) value and its standard deviation at (..., 2) positions.
@@ -131,27 +132,11 @@ class KrigedSurface:
         includes that of the mean and, of up to `MIXED_POINTS` points, of length and size.
         """
         at = np.asarray(xy_m, float)
-        values, variances = [], []  # of each process (q,)
-        for process in self.processes:
-            value, solved, of_mean = process.at(at.reshape(-1, 2))
-            values.append(value)
-            variances.append(process.std**2 - np.einsum("nq,nq->q", solved, solved) + of_mean**2)
+        moments = np.array([process.moments(at.reshape(-1, 2)) for process in self.processes])
+        values, variances = moments.swapaxes(0, 1)  # (k, q)
         value = self.shares @ values
-        variance = self.shares @ (np.maximum(variances, 0) + (values - value) ** 2)
+        variance = self.shares @ (variances + (values - value) ** 2)
         return value.reshape(at.shape[:-1]), np.sqrt(variance).reshape(at.shape[:-1])
-
-    def covariance(self, a_m: npt.ArrayLike, b_m: npt.ArrayLike) -> FloatArray:
-        """(p, q) covariance of the quantity between (p, 2) and (q, 2) positions, as `predict` knows it."""
-        a, b = np.asarray(a_m, float), np.asarray(b_m, float)
-        total, means_a, means_b = np.zeros((len(a), len(b))), [], []
-        for share, process in zip(self.shares, self.processes, strict=True):
-            (mean_a, solved_a, of_a), (mean_b, solved_b, of_b) = process.at(a), process.at(b)
-            known = solved_a.T @ solved_b
-            total += share * (process.before(a, b) - known + np.outer(of_a, of_b))
-            means_a.append(mean_a)
-            means_b.append(mean_b)
-        apart_a, apart_b = (np.array(means) - self.shares @ means for means in (means_a, means_b))
-        return np.asarray(total + (self.shares[:, None] * apart_a).T @ apart_b)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,16 +169,11 @@ class TiledSurface:
         for k in range(len(tiles)):
             own = tile_of.ravel() == k
             _, near = points.query(flat[own].mean(axis=0), k=_NEIGHBOURS)
-            part = _surface(
-                self.xy_m[near],
-                self.values[near],
-                self.noise_std[near],
-                self.length_m,
-                self.process_std,
-            )
-            found[:, own] = part.predict(flat[own])
-        value, std = found.reshape(2, *at.shape[:-1])
-        return value, std
+            known = self.xy_m[near], self.values[near], self.noise_std[near]
+            part = Process.of(*known, self.length_m, self.process_std)
+            found[:, own] = part.moments(flat[own])
+        value, variance = found.reshape(2, *at.shape[:-1])
+        return value, np.sqrt(variance)
 
 
 def krige_many(
@@ -213,8 +193,9 @@ def krige_many(
         return krige(xy, y, noise)
     tree = cKDTree(xy)
     centres = xy[np.linspace(0, len(xy) - 1, 5).astype(int)]
-    parts = [krige(xy[near], y[near], noise[near]) for near in tree.query(centres, k=FIT_POINTS)[1]]
-    length_m, std = np.median([[part.length_m, part.process_std] for part in parts], axis=0)
+    _, near = tree.query(centres, k=FIT_POINTS)
+    parts = [krige(xy[of], y[of], noise[of]).likeliest for of in near]
+    length_m, std = np.median([[part.length_m, part.std] for part in parts], axis=0)
     return TiledSurface(xy, y, noise, float(length_m), float(std))
 
 
@@ -278,10 +259,12 @@ def krige(
         ),
         key=lambda found: found.fun,
     )
-    if len(y) > MIXED_POINTS:
-        return _surface(xy, y, noise, *np.exp(best.x).tolist())
-    spread = _spread(best.x, (lowest, min(highest, np.log(3 * extent))), (least, most), distances, y, noise)
-    return _mixture(xy, y, noise, best.x, *spread)
+    at, shares = best.x[None], np.ones(1)
+    if len(y) <= MIXED_POINTS:
+        lengths = lowest, min(highest, np.log(3 * extent))
+        at, shares = _spread(best.x, lengths, (least, most), distances, y, noise)
+    processes = tuple(Process.of(xy, y, noise, *each) for each in np.exp(at).tolist())
+    return KrigedSurface(processes, shares)
 
 
 def _spread(
@@ -318,28 +301,6 @@ def _spread(
     share = np.exp(np.array(log_share) - max(log_share))
     kept = share > _LEAST_SHARE
     return np.array(at)[kept], share[kept] / share[kept].sum()
-
-
-def _mixture(
-    xy_m: FloatArray,
-    y: FloatArray,
-    noise: FloatArray,
-    best: FloatArray,
-    at: FloatArray,
-    shares: FloatArray,
-) -> KrigedSurface:
-    """A surface of some processes, given by logarithms (k, 2) of length and size."""
-    processes = tuple(_Process.of(xy_m, y, noise, *each) for each in np.exp(at).tolist())
-    length_m, process_std = np.exp(best).tolist()
-    return KrigedSurface(xy_m, length_m, process_std, processes, shares)
-
-
-def _surface(
-    xy_m: FloatArray, y: FloatArray, noise: FloatArray, length: float, size: float
-) -> KrigedSurface:
-    """A surface of one process."""
-    best = np.log([length, size])
-    return _mixture(xy_m, y, noise, best, best[None], np.ones(1))
 
 
 def _cost(

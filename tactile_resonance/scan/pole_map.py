@@ -237,14 +237,15 @@ class PoleMap:
         kriged = self.krige()
         if kriged is None:
             return None
-        low, high = kriged.xy_m.min(axis=0), kriged.xy_m.max(axis=0)
+        places = np.array([p.position_m for p in self.with_ellipse])
+        known, heights = places[:, :2], places[:, 2]
+        low, high = known.min(axis=0), known.max(axis=0)
         counts = np.maximum(np.rint(cells * (high - low) / np.max(high - low)), 1).astype(int)
         x, y = (np.linspace(low[k], high[k], counts[k] + 1) for k in range(2))
         xy = np.stack(np.meshgrid(x, y), axis=-1)  # (r, c, 2)
         value, std = kriged.predict(xy)
-        heights = np.array([p.position_m[2] for p in self.with_ellipse])
-        z = griddata(kriged.xy_m, heights, xy, method="linear")
-        z = np.where(np.isnan(z), griddata(kriged.xy_m, heights, xy, method="nearest"), z)
+        z = griddata(known, heights, xy, method="linear")
+        z = np.where(np.isnan(z), griddata(known, heights, xy, method="nearest"), z)
         return MapSurface(np.concatenate([xy, z[..., None]], axis=-1), value, std)
 
 
