@@ -68,7 +68,7 @@ def clear_points(
         else:
             kept.append(point)
             continue
-        left.append(LeftOut(point, f"{why} {1e3 * height:.2f} mm above the surface; {accepted}"))
+        left.append((point, f"{why} {1e3 * height:.2f} mm above the surface; {accepted}"))
     return tuple(kept), tuple(left)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -53,11 +53,8 @@ class ScanPoint:
         require(self.index >= 0, "index", self.index, "0 or above")
 
 
-class LeftOut(NamedTuple):
-    """A point that is left out of a plan, and why."""
-
-    point: ScanPoint
-    why: str
+LeftOut = tuple[ScanPoint, str]
+"""A point that is left out of a plan, and why."""
 
 
 def scan_points(

@@ -15,8 +15,8 @@ and a circle of 2 mm. Four touches or more leave nothing of that, and check each
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,7 +93,7 @@ def prepare(
         return plan, facts
     force_n, count = asked.force_n or scene.force_n, len(plan.points)
     try:
-        normals, left = find_normals(
+        points, normals, left = find_normals(
             plan.points,
             asked,
             ball_radius_m,
@@ -102,45 +102,9 @@ def prepare(
         )
     except (PointFailed, ScanEnded) as error:
         raise ValueError(f"normals: {error}") from error
-    facts["normals"] = [normal.as_json() for normal in normals]
-    plan = plan.with_points([normal.point for normal in normals], left)
+    facts["normals"] = normals
+    plan = plan.with_points(points, left)
     return plan.clear_of(surface, use), facts
-
-
-@dataclass(frozen=True, eq=False)
-class FoundNormal:
-    """A normal and the touches it rests on.
-
-    Attributes
-    ----------
-    point : ScanPoint
-        With the normal found, where the ball touches the surface when it is straight above the point that was
-        asked for: beside that by the ball's radius times the sine of the angle.
-    std_rad : float
-        Standard deviation of the normal about the axis about which it is known least [rad].
-    angle_rad : float
-        Between it and the normal that was expected.
-    worst_m : float
-        Largest distance of a touch from the plane through all [m]; of three touches none is off.
-    touches : tuple of Touch
-    """
-
-    point: ScanPoint
-    std_rad: float
-    angle_rad: float
-    worst_m: float
-    touches: tuple[Touch, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """What a run keeps of it; lengths in metres."""
-        return {
-            "position_m": list(self.point.position_m),
-            "normal": list(self.point.normal),
-            "std_rad": self.std_rad,
-            "angle_rad": self.angle_rad,
-            "worst_m": self.worst_m,
-            "touches": [{"ball_m": list(t.ball_m), "std_m": t.std_m} for t in self.touches],
-        }
 
 
 def find_normals(
@@ -149,8 +113,8 @@ def find_normals(
     ball_radius_m: float,
     heading_rad: float,
     touch: Callable[[ScanPoint], Touch],
-) -> tuple[tuple[FoundNormal, ...], tuple[LeftOut, ...]]:
-    """Touch around each point; those whose normal is not found, or is refused, are left out.
+) -> tuple[list[ScanPoint], list[dict[str, Any]], list[LeftOut]]:
+    """Touch around each point: `normal_of_touches`; those whose normal is not found, or is refused, are left out.
 
     Parameters
     ----------
@@ -166,20 +130,22 @@ def find_normals(
     PointDisturbed
         That `touch` raised: it says nothing of the point.
     """
-    found: list[FoundNormal] = []
+    found: list[ScanPoint] = []
+    normals: list[dict[str, Any]] = []
     left: list[LeftOut] = []
     for point in points:
         try:
             touches = tuple(touch(around) for around in places_around(point, request))
-            normal = normal_of_touches(point, touches, ball_radius_m, heading_rad)
-            _require_good(normal, request)
+            made, facts = normal_of_touches(point, touches, ball_radius_m, heading_rad)
+            _require_good(facts, request)
         except PointDisturbed:  # says nothing of the point
             raise
         except (PointFailed, ValueError) as error:
-            left.append(LeftOut(point, f"normals: {error}"))
+            left.append((point, f"normals: {error}"))
         else:
-            found.append(normal)
-    return tuple(found), tuple(left)
+            found.append(made)
+            normals.append(facts)
+    return found, normals, left
 
 
 def places_around(point: ScanPoint, request: NormalRequest) -> list[ScanPoint]:
@@ -196,7 +162,7 @@ def places_around(point: ScanPoint, request: NormalRequest) -> list[ScanPoint]:
 
 def normal_of_touches(
     point: ScanPoint, touches: tuple[Touch, ...], ball_radius_m: float, heading_rad: float
-) -> FoundNormal:
+) -> tuple[ScanPoint, dict[str, Any]]:
     """Normal of the plane through the ball's centres, and the place that it belongs to.
 
     Parameters
@@ -207,6 +173,15 @@ def normal_of_touches(
         Three or more, along its normal, so that their deviations are those of heights along it.
     ball_radius_m, heading_rad : float
 
+    Returns
+    -------
+    point : ScanPoint
+        With the normal found, where the ball touches the surface when it is straight above the point that was
+        asked for: beside that by the ball's radius times the sine of the angle.
+    facts : dict
+        What a run keeps of it [m, rad]: the angle from the normal that was expected, the standard deviation about
+        the axis about which the normal is known least, the largest distance of a touch from the plane.
+
     Raises
     ------
     ValueError
@@ -216,14 +191,10 @@ def normal_of_touches(
     local = (np.array([touch.ball_m for touch in touches]) - place) @ turn  # (n, 3)
     plane = fit_surface(local, [touch.std_m for touch in touches], "plane")
     across = plane.normal([0.0, 0.0])
-    height, slopes = (
-        float(plane.height_m([0.0, 0.0])),
-        plane.covariance_m2[1:, 1:] / plane.scale_m**2,
-    )
+    slopes = plane.covariance_m2[1:, 1:] / plane.scale_m**2
     normal = turn @ across
     # the ball above the point touches beside it on a slope; of that place, not of the point's, is the normal
-    touched = place + height * turn[:, 2] - ball_radius_m * normal
-    worst = float(np.max(np.abs(plane.residuals_m)))
+    touched = place + float(plane.height_m([0.0, 0.0])) * turn[:, 2] - ball_radius_m * normal
     made = replace(
         point,
         position_m=tuple(touched.tolist()),
@@ -231,22 +202,24 @@ def normal_of_touches(
         orientation_xyzw=tuple(tip_orientation(normal, heading_rad).tolist()),
         height_std_m=float(plane.height_std_m([0.0, 0.0])),
     )
-    # an angle is no larger than its tangent
-    std = math.sqrt(float(np.linalg.eigvalsh(slopes)[-1]))
-    return FoundNormal(made, std, math.acos(min(1.0, float(across[2]))), worst, touches)
+    return made, {
+        "position_m": touched.tolist(),
+        "normal": normal.tolist(),
+        # an angle is no larger than its tangent
+        "std_rad": math.sqrt(float(np.linalg.eigvalsh(slopes)[-1])),
+        "angle_rad": math.acos(min(1.0, float(across[2]))),
+        "worst_m": float(np.max(np.abs(plane.residuals_m))),
+        "touches": [{"ball_m": list(touch.ball_m), "std_m": touch.std_m} for touch in touches],
+    }
 
 
-def _require_good(found: FoundNormal, request: NormalRequest) -> None:
+def _require_good(facts: Mapping[str, Any], request: NormalRequest) -> None:
+    angle, worst, std = (facts[name] for name in ("angle_rad", "worst_m", "std_rad"))
+    off = "a touch off the plane through all [m]"
     for what, value, name, otherwise in (
-        ("angle from the expected normal [rad]", round(found.angle_rad, 4), "most_angle_rad", ""),
-        (
-            *("a touch off the plane through all [m]", round(found.worst_m, 6)),
-            *("tolerance_m", ": a smaller radius_m, or a smooth place"),
-        ),
-        (
-            *("standard deviation [rad]", round(found.std_rad, 4)),
-            *("most_std_rad", ": a larger radius_m, or more touches"),
-        ),
+        ("angle from the expected normal [rad]", round(angle, 4), "most_angle_rad", ""),
+        (off, round(worst, 6), "tolerance_m", ": a smaller radius_m, or a smooth place"),
+        ("standard deviation [rad]", round(std, 4), "most_std_rad", ": a larger radius_m, or more touches"),
     ):
         most = getattr(request, name)
         require(value <= most, what, value, f"{name} = {most:g} or less{otherwise}")

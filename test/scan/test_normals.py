@@ -3,6 +3,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -69,7 +70,8 @@ def on_sphere(centre_m, radius_m):
 
 def found_of(point, request, touch):
     touches = tuple(touch(around) for around in places_around(point, request))
-    return normal_of_touches(point, touches, RADIUS_M, 0.3)
+    made, facts = normal_of_touches(point, touches, RADIUS_M, 0.3)
+    return SimpleNamespace(point=made, **facts)
 
 
 def angle(a, b):
@@ -169,8 +171,9 @@ def test_what_cannot_be_relied_on_is_left_out_with_its_figure():
             made = Touch((x, y, z + 1e-3), made.std_m, made.force_n)
         return made
 
-    found, left = find_normals(points, FOUR, RADIUS_M, 0.3, touch)
-    assert [normal.point.index for normal in found] == [0]
+    found, facts, left = find_normals(points, FOUR, RADIUS_M, 0.3, touch)
+    assert [point.index for point in found] == [0]
+    assert facts[0]["position_m"] == list(found[0].position_m)
     assert [point for point, _ in left] == points[1:]
     for (_, why), text in zip(
         left,
@@ -183,8 +186,8 @@ def test_what_cannot_be_relied_on_is_left_out_with_its_figure():
     ):
         assert text in why
     vague = NormalRequest(radius_m=5e-4)
-    found, ((_, why),) = find_normals(points[:1], vague, RADIUS_M, 0.3, touch)
-    assert not found
+    found, facts, ((_, why),) = find_normals(points[:1], vague, RADIUS_M, 0.3, touch)
+    assert not (found or facts)
     assert "got 0.049; accepted is most_std_rad = 0.03 or less: a larger radius_m" in why
 
     def disturbed(point):
@@ -204,8 +207,8 @@ def test_plan_goes_on_with_the_points_whose_normals_were_found():
             raise PointFailed("adhesion")
         return touching(on_plane(np.zeros(3), [0.2, 0.0, 1.0]))(point)
 
-    found, left = find_normals(plan.points, THREE, RADIUS_M, 0.0, touch)
-    after = plan.with_points([normal.point for normal in found], left)
+    found, _, left = find_normals(plan.points, THREE, RADIUS_M, 0.0, touch)
+    after = plan.with_points(found, left)
     (point,) = after.points
     beside = RADIUS_M * np.sin(np.arctan(0.2))  # where a ball straight above the place touches
     assert (point.index, point.label) == (0, "dome, point 1")
@@ -256,15 +259,15 @@ def test_normal_of_a_sphere_of_tissue_is_found_by_contacts(hollow):
         ball = np.array(point.position_m) + (RADIUS_M + result.surface_m) * np.array(point.normal)
         return Touch(tuple(ball.tolist()), max(result.surface_std_m, 2e-5), result.force_n)
 
-    (found,), left = find_normals([expected([0, 0, 1])], THREE, RADIUS_M, 0.0, touch)
+    (found,), (facts,), left = find_normals([expected([0, 0, 1])], THREE, RADIUS_M, 0.0, touch)
     assert not left
     # of curvature less than 0.01 rad, as the closed form above has it
-    off = angle(found.point.normal, true)
-    assert off < 3 * found.std_rad + 0.01
+    off = angle(found.normal, true)
+    assert off < 3 * facts["std_rad"] + 0.01
     assert off < 0.6 * tilt
-    assert found.std_rad < THREE.most_std_rad
-    place = np.array(found.point.position_m)
+    assert facts["std_rad"] < THREE.most_std_rad
+    place = np.array(found.position_m)
     assert np.linalg.norm(place - surface.centre_m) == pytest.approx(10e-3, abs=4e-4)
     # and the contact is then made along what was found
-    pose = touch_pose(found.point.position_m, found.point.normal, [1, 0, 0], RADIUS_M)
+    pose = touch_pose(found.position_m, found.normal, [1, 0, 0], RADIUS_M)
     assert loop.make(ContactGoal(pose, Aim(FORCE_N))).reached
