@@ -38,6 +38,18 @@ class Verdict(str, Enum):
 
 
 @dataclass(frozen=True)
+class BlockLimits:
+    """Fewest and most blocks at a point."""
+
+    least: int = 3
+    most: int = 8
+
+    def __post_init__(self) -> None:
+        require(self.least >= 1, "least", self.least, "1 or above")
+        require(self.most >= self.least, "most", self.most, f"at least least = {self.least}")
+
+
+@dataclass(frozen=True)
 class Precise:
     """Standard deviations asked for; None: as it comes.
 
@@ -49,6 +61,22 @@ class Precise:
 
     def __post_init__(self) -> None:
         check_above_zero(self, "f0_std_hz", "damping_ratio_std")
+
+    def verdict(
+        self, estimate: FloatArray, covariance: FloatArray, noise: FloatArray, blocks: int, limits: BlockLimits
+    ) -> tuple[Verdict, str]:
+        """Whether it is reached, or out of reach: noise falls with the number of blocks, other errors stay."""
+        stds = (self.f0_std_hz, self.damping_ratio_std)
+        asked = np.array([math.inf if std is None else std for std in stds])
+        variance = np.diag(covariance)
+        if np.all(np.sqrt(variance) <= asked):
+            return Verdict.PRECISE, ""
+        falling = np.fmin(np.diag(noise), variance)  # all of it where its noise is unknown
+        last = np.sqrt(variance - falling + falling * blocks / limits.most)
+        missing = np.sqrt(variance) > asked
+        if blocks < limits.most and np.any(missing & (last > HOPELESS_FACTOR * asked)):
+            return Verdict.HOPELESS, ""
+        return Verdict.CONTINUE, ""
 
 
 @dataclass(frozen=True)
@@ -64,17 +92,58 @@ class Separate:
         names = (self.first.name, self.second.name)
         require(names[0] != names[1], "separate", names, "two classes")
 
+    def verdict(
+        self, estimate: FloatArray, covariance: FloatArray, noise: FloatArray, blocks: int, limits: BlockLimits
+    ) -> tuple[Verdict, str]:
+        """Verdict and class, by Wald's sequential test with equal errors (Ann. Math. Stat. 16 (1945) 117).
 
-@dataclass(frozen=True)
-class BlockLimits:
-    """Fewest and most blocks at a point."""
+        A likelihood ratio of all that was seen is a martingale under the class in its denominator, whatever the
+        blocks have in common, so that its bound holds whenever the test stops (Ville). It gives up where the
+        blocks left will not take it to either bound, which causes no errors.
+        """
+        classes = [self.first, self.second]
+        if classify(estimate, covariance, classes, NEITHER_LEVEL).name == UNKNOWN:
+            return Verdict.NEITHER, ""
+        threshold = math.log(self.probability / (1 - self.probability))
+        ratio = self.log_likelihood_ratio(estimate, covariance)
+        if abs(ratio) >= threshold:
+            return Verdict.SEPARATED, classes[0 if ratio > 0 else 1].name
+        left = 1 - blocks / limits.most
+        if left > 0 and self._highest(estimate, covariance, noise, left) < threshold:
+            return Verdict.HOPELESS, ""
+        return Verdict.CONTINUE, ""
 
-    least: int = 3
-    most: int = 8
+    def log_likelihood_ratio(self, estimate: FloatArray, covariance: FloatArray) -> float:
+        """Logarithm of p(estimate | first) / p(estimate | second), class spread included.
 
-    def __post_init__(self) -> None:
-        require(self.least >= 1, "least", self.least, "1 or above")
-        require(self.most >= self.least, "most", self.most, f"at least least = {self.least}")
+        For poles of all blocks together, with covariance C / n, it equals the sum over n independent blocks
+        of covariance C where the classes have no spread: Wald's statistic. With spread it is still the
+        likelihood ratio of all that was seen.
+        """
+        first = log_density(estimate, covariance, self.first)
+        return first - log_density(estimate, covariance, self.second)
+
+    def _highest(
+        self, estimate: FloatArray, covariance: FloatArray, noise: FloatArray, left: float
+    ) -> float:
+        """How high the ratio may yet rise, or its negative, where this share of all blocks is left.
+
+        The estimate of all blocks differs from the present one by the noise that goes; the ratio is all but
+        linear in it.
+        """
+        known = np.all(np.diag(noise) <= np.diag(covariance))  # not where it is NaN
+        going = left * (noise if known else covariance)
+        last = covariance - going
+        ratio = abs(self.log_likelihood_ratio(estimate, last))
+        unit = np.sqrt(np.diag(going))
+        values, vectors = np.linalg.eigh(going / np.outer(unit, unit))
+        steps = (vectors * np.sqrt(np.maximum(values, 0))).T * unit
+        moved = [
+            self.log_likelihood_ratio(estimate + step, last)
+            - self.log_likelihood_ratio(estimate - step, last)
+            for step in steps
+        ]
+        return ratio + HOPELESS_STDS * float(np.linalg.norm(moved)) / 2
 
 
 @dataclass(frozen=True)
@@ -174,101 +243,11 @@ def decide_mode(
     verdict, called = Verdict.CONTINUE, ""
     known = np.all(np.isfinite(best)) and np.all(np.isfinite(x))
     if blocks >= limits.least and wanted is not None and known:
-        if isinstance(wanted, Separate):
-            verdict, called = _separated(x, best, of_noise, blocks, wanted, limits)
-        else:
-            verdict = _precise(best, of_noise, blocks, wanted, limits)
+        verdict, called = wanted.verdict(x, best, of_noise, blocks, limits)
     if verdict is Verdict.CONTINUE and blocks >= limits.most:
         verdict = Verdict.MOST_BLOCKS
     saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
     return Decision(verdict, blocks, saved, saved * block_s, called)
-
-
-def log_likelihood_ratio(estimate: FloatArray, covariance: FloatArray, wanted: Separate) -> float:
-    """Logarithm of p(estimate | first) / p(estimate | second), class spread included.
-
-    For poles of all blocks together, with covariance C / n, it equals the sum over n independent blocks
-    of covariance C where the classes have no spread: Wald's statistic. With spread it is still the
-    likelihood ratio of all that was seen.
-    """
-    first = log_density(estimate, covariance, wanted.first)
-    return first - log_density(estimate, covariance, wanted.second)
-
-
-def _separated(
-    estimate: FloatArray,
-    covariance: FloatArray,
-    noise: FloatArray,
-    blocks: int,
-    wanted: Separate,
-    limits: BlockLimits,
-) -> tuple[Verdict, str]:
-    """Verdict and class, by Wald's sequential test with equal errors (Ann. Math. Stat. 16 (1945) 117).
-
-    A likelihood ratio of all that was seen is a martingale under the class in its denominator, whatever the
-    blocks have in common, so that its bound holds whenever the test stops (Ville). It gives up where the
-    blocks left will not take it to either bound, which causes no errors.
-    """
-    a, b = wanted.first, wanted.second
-    if classify(estimate, covariance, [a, b], NEITHER_LEVEL).name == UNKNOWN:
-        return Verdict.NEITHER, ""
-    threshold = math.log(wanted.probability / (1 - wanted.probability))
-    ratio = log_likelihood_ratio(estimate, covariance, wanted)
-    if abs(ratio) >= threshold:
-        return Verdict.SEPARATED, a.name if ratio > 0 else b.name
-    left = 1 - blocks / limits.most
-    if left > 0 and _out_of_reach(estimate, covariance, noise, left, wanted, threshold):
-        return Verdict.HOPELESS, ""
-    return Verdict.CONTINUE, ""
-
-
-def _out_of_reach(
-    estimate: FloatArray,
-    covariance: FloatArray,
-    noise: FloatArray,
-    left: float,
-    wanted: Separate,
-    threshold: float,
-) -> bool:
-    """Whether the log likelihood ratio will stay within the bounds though this share of all blocks is left.
-
-    The estimate of all blocks differs from the present one by the noise that goes; the ratio is all but
-    linear in it.
-    """
-    known = np.all(np.diag(noise) <= np.diag(covariance))  # not where it is NaN
-    going = left * (noise if known else covariance)
-    last = covariance - going
-    ratio = abs(log_likelihood_ratio(estimate, last, wanted))
-    unit = np.sqrt(np.diag(going))
-    values, vectors = np.linalg.eigh(going / np.outer(unit, unit))
-    steps = (vectors * np.sqrt(np.maximum(values, 0))).T * unit
-    moved = [
-        log_likelihood_ratio(estimate + step, last, wanted)
-        - log_likelihood_ratio(estimate - step, last, wanted)
-        for step in steps
-    ]
-    return ratio + HOPELESS_STDS * float(np.linalg.norm(moved)) / 2 < threshold
-
-
-def _precise(
-    covariance: FloatArray,
-    noise: FloatArray,
-    blocks: int,
-    wanted: Precise,
-    limits: BlockLimits,
-) -> Verdict:
-    """Noise falls with the number of blocks, distortion and model error stay."""
-    stds = (wanted.f0_std_hz, wanted.damping_ratio_std)
-    asked = np.array([math.inf if std is None else std for std in stds])
-    variance = np.diag(covariance)
-    if np.all(np.sqrt(variance) <= asked):
-        return Verdict.PRECISE
-    falling = np.fmin(np.diag(noise), variance)  # all of it where its noise is unknown
-    last = np.sqrt(variance - falling + falling * blocks / limits.most)
-    missing = np.sqrt(variance) > asked
-    if blocks < limits.most and np.any(missing & (last > HOPELESS_FACTOR * asked)):
-        return Verdict.HOPELESS
-    return Verdict.CONTINUE
 
 
 @dataclass(frozen=True)

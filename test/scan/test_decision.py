@@ -15,7 +15,6 @@ from tactile_resonance.scan.decision import (
     Verdict,
     decide,
     decide_mode,
-    log_likelihood_ratio,
 )
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import (
@@ -95,8 +94,8 @@ def test_likelihood_ratio_of_all_blocks_is_the_sum_over_blocks():
     rng = np.random.default_rng(7)
     wanted = Separate(*point_classes(1.5), probability=0.99)
     x = rng.multivariate_normal(wanted.first.mean, BLOCK, 6)
-    together = log_likelihood_ratio(x.mean(axis=0), BLOCK / 6, wanted)
-    apart = sum(log_likelihood_ratio(xi, BLOCK, wanted) for xi in x)
+    together = wanted.log_likelihood_ratio(x.mean(axis=0), BLOCK / 6)
+    apart = sum(wanted.log_likelihood_ratio(xi, BLOCK) for xi in x)
     assert together == pytest.approx(apart, rel=1e-9)
 
 
