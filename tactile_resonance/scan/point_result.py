@@ -203,8 +203,8 @@ def is_poles(topic: str) -> bool:
     return topic.rsplit("/", 1)[-1] == "poles"
 
 
-def to_message(result: PointResult, poles: Any = None) -> Any:
-    """Message as rosbags knows it, ready for `to_cdr`.
+def serialised(result: PointResult, poles: Any = None) -> bytes:
+    """The message of a result as it travels (CDR).
 
     Parameters
     ----------
@@ -217,12 +217,8 @@ def to_message(result: PointResult, poles: Any = None) -> Any:
         make_message(DISTORTION_TYPE, **asdict(band)) for band in result.distortion
     ]
     header = header_message(result.frame_id, result.time_ns)
-    return make_message(TYPE, header=header, poles=[] if poles is None else [poles], **content)
-
-
-def serialised(result: PointResult, poles: Any = None) -> bytes:
-    """The message of `to_message` as it travels (CDR)."""
-    return to_cdr(to_message(result, poles))
+    bands = [] if poles is None else [poles]
+    return to_cdr(make_message(TYPE, header=header, poles=bands, **content))
 
 
 def from_message(message: Any) -> PointResult:
@@ -281,18 +277,13 @@ def band_results(poles: Poles) -> tuple[BandResult, ...]:
     )
 
 
-def as_csv(results: Iterable[PointResult]) -> str:
-    """One row each, numbers with all their digits, unknown numbers ``nan``.
-
-    Where a result has them, columns for the poles of further bands, numbered from ``f0_hz_2``, and for the
-    distortion in each band, ``distortion_even_db``, ``distortion_even_db_2``, ..., follow the others. A text
-    that a spreadsheet would take for a formula begins with an apostrophe.
-    """
-    return _table([_row(result) for result in results])[0]
-
-
 class ResultsFile:
     """``results.csv`` as it grows: a row is appended where it can be, else all are written anew.
+
+    Numbers stand with all their digits, unknown ones are ``nan``. Where a result has them, columns for the poles
+    of further bands, numbered from ``f0_hz_2``, and for the distortion in each band, ``distortion_even_db``,
+    ``distortion_even_db_2``, ..., follow the others. A text that a spreadsheet would take for a formula begins
+    with an apostrophe.
 
     Parameters
     ----------
@@ -327,7 +318,11 @@ class ResultsFile:
 
     def _write(self, results: Sequence[PointResult]) -> None:
         self._last = max((result.index for result in results), default=-1)
-        text, self._columns = _table([_row(result) for result in results])
+        rows = [_row(result) for result in results]
+        # those that any row has, distortion last
+        names = dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)])
+        self._columns = sorted(names, key=lambda name: name.startswith("distortion_"))
+        text = csv_text([self._columns, *(_cells(row, self._columns) for row in rows)])
         write_whole(self._path, text.encode())
 
 
@@ -345,10 +340,3 @@ def _row(result: PointResult) -> dict[str, object]:
 
 def _cells(row: Mapping[str, object], columns: Iterable[str]) -> list[object]:
     return [row.get(name, NAN) for name in columns]
-
-
-def _table(rows: Sequence[Mapping[str, object]]) -> tuple[str, list[str]]:
-    """Text of a table, and its columns: those that any row has, distortion last."""
-    names = dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)])
-    columns = sorted(names, key=lambda name: name.startswith("distortion_"))
-    return csv_text([columns, *(_cells(row, columns) for row in rows)]), columns

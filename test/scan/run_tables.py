@@ -3,12 +3,20 @@
 
 import csv
 from dataclasses import asdict, fields
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.scan.messages import make_message, to_cdr
-from tactile_resonance.scan.point_result import COLUMNS, PointKind, PointOutcome, PointResult
+from tactile_resonance.scan.point_result import (
+    COLUMNS,
+    PointKind,
+    PointOutcome,
+    PointResult,
+    ResultsFile,
+)
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.recorded import EXCITATION, RECORD
 
@@ -26,6 +34,13 @@ VALUES = {
     "PointKind": PointKind,
     "PointOutcome": lambda text: PointOutcome[text.upper()],
 }
+
+
+def as_csv(results):
+    """Text of results.csv, written at once."""
+    with TemporaryDirectory() as folder:
+        ResultsFile(Path(folder), results)
+        return (Path(folder) / "results.csv").read_text()
 
 
 def table_of(run_folder):

@@ -16,7 +16,7 @@ from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.point_result import TYPE as RESULT
-from tactile_resonance.scan.point_result import to_message
+from tactile_resonance.scan.point_result import serialised
 from tactile_resonance.scan.recorded import EXCITATION, read_recorded, recorded_results
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
@@ -101,10 +101,11 @@ def old_run(folder, **versions):
     """A run of two points, the first of them recorded by a version with other definitions."""
     versions = {{"Record": RECORD, "PointResult": RESULT}[k]: v for k, v in versions.items()}
     RunDirectory.create(folder, "name: x\n", plan(2), {"seed": 1}).close()
+    cdr = serialised(result(0, measurement_id=KEY, repeats=2, notes="x"))
     messages = [
         ("/excitation", EXCITATION, excitation()),
         *(("/record", RECORD, record(block)) for block in range(2)),
-        ("/point_result", RESULT, to_message(result(0, measurement_id=KEY, repeats=2, notes="x"))),
+        ("/point_result", RESULT, message_types().deserialize_cdr(cdr, RESULT)),
     ]
     write(folder / "recording" / "point-00000-00.mcap", messages, versions)
     return folder

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.scan.point_result import BandResult, ResultsFile, as_csv
+from tactile_resonance.scan.point_result import BandResult, ResultsFile
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from run_tables import result
+from run_tables import as_csv, result
 
 
 def test_a_file_that_grows_is_the_table_of_the_latest_attempts(tmp_path):

@@ -20,7 +20,7 @@ from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.map_messages import POINT, cloud_message, marker_message
 from tactile_resonance.scan.messages import header_message
 from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result, with_poles
-from tactile_resonance.scan.point_result import PointOutcome, PointResult, as_csv
+from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.points import tip_orientation
 from tactile_resonance.scan.pole_map import (
     SAME_PLACE_M,
@@ -36,6 +36,7 @@ from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalCo
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from bench_hands import scene
+from run_tables import as_csv
 
 COVARIANCE = np.array([[0.02**2, 0.5 * 0.02 * 8e-5], [0.5 * 0.02 * 8e-5, 8e-5**2]])
 SOFT = TissueClass("soft", np.array([250.0, 0.03]), np.diag([0.5**2, 0.001**2]))
