@@ -12,7 +12,7 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import counted
 from tactile_resonance.scan.adaptive import known_points
-from tactile_resonance.scan.clearance import TipUse, clear_points, is_along, is_plane
+from tactile_resonance.scan.clearance import is_along, is_plane
 from tactile_resonance.scan.measurement import MeasurementDesign, Skipped, design_measurement
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.points import (
@@ -159,16 +159,6 @@ class Plan:
         numbered = tuple(self._numbered(point, index) for index, point in enumerate(points))
         entries = [Skipped(f"the point at {_in_mm(point)}", why, each_s) for point, why in left]
         return replace(self, points=numbered, left_out=(*self.left_out, *entries))
-
-    def clear_of(self, surface: Surface, use: TipUse | None) -> Plan:
-        """The same without points at which the sensor would not stay clear of a surface; None: not looked at.
-
-        Raises
-        ------
-        ValueError
-            If that is all of them.
-        """
-        return self if use is None else self.with_points(*clear_points(self.points, surface, use))
 
 
 def plan_points(scene: ScanScene, points: tuple[ScanPoint, ...]) -> Plan:

@@ -27,23 +27,18 @@ from tactile_resonance.sensor import MAX_LEVEL_V
 Rows = list[tuple[str, str]]
 
 
-def touches(scene: ScanScene, points: int) -> tuple[int, int]:
-    """How often the tissue is touched before the first of so many points is measured, and in all."""
-    before = len(scene.surface.points_m) if isinstance(scene.surface, TouchRequest) else 0
-    before += scene.normals.touches * points if scene.normals else 0
-    return before, before + points
-
-
 def plan_rows(plan: Plan) -> Rows:
     """What a scan will excite, compute, publish and draw, with names for people."""
     scene, design, count = plan.scene, plan.measurement, plan.most_points
-    before, in_all = touches(scene, count)
+    # touches before the first point is measured
+    before = len(scene.surface.points_m) if isinstance(scene.surface, TouchRequest) else 0
+    before += scene.normals.touches * count if scene.normals else 0
     stretches = " and ".join(f"{low:g} to {high:g}" for low, high in design.stretches_hz)
     at_most = "at most " if scene.adaptive else ""
     rows = [
         (
             "touches",
-            f"{at_most}{in_all}: {counted(count, 'point')}"
+            f"{at_most}{before + count}: {counted(count, 'point')}"
             + (f", {before} for surface and normals" if before else ""),
         ),
     ]

@@ -138,23 +138,6 @@ def grid_within(polygon_m: FloatArray, spacing_m: npt.ArrayLike, order: str) -> 
     return whole[inside_polygon(whole, polygon_m)]
 
 
-def spiral(center_m: npt.ArrayLike, radius_m: float, spacing_m: float) -> FloatArray:
-    """(n, 2) positions of an Archimedean spiral from its centre outwards [m].
-
-    Neighbours along the spiral and from turn to turn lie about `spacing_m` apart.
-    """
-    _check_count(np.pi * (radius_m / spacing_m) ** 2)
-    pitch = spacing_m / (2 * np.pi)  # radius per angle
-    # arc length of r = pitch angle, inverted on a fine table
-    last = radius_m / pitch
-    angle = np.linspace(0.0, last, 16 + int(40 * last))
-    length = pitch / 2 * (angle * np.sqrt(1 + angle**2) + np.arcsinh(angle))
-    steps = np.arange(0.0, length[-1] + 1e-9 * spacing_m, spacing_m)
-    turned = np.interp(steps, length, angle)
-    offset = pitch * turned[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
-    return np.asarray(np.asarray(center_m, float) + offset)
-
-
 def inside_polygon(xy_m: npt.ArrayLike, polygon_m: npt.ArrayLike) -> BoolArray:
     """(...) whether (..., 2) positions lie in a polygon of (k, 2) corners, or on its edge.
 
@@ -270,8 +253,19 @@ class _Spiral:
     spacing_m: Spacing
 
     def positions(self) -> FloatArray:
+        """Of an Archimedean one, outwards; neighbours along it and from turn to turn lie about a spacing apart."""
         check_above_zero(self, "radius_m")
-        return flat(spiral(self.center_m, self.radius_m, self.spacing_m[0]))
+        spacing_m = self.spacing_m[0]
+        _check_count(np.pi * (self.radius_m / spacing_m) ** 2)
+        pitch = spacing_m / (2 * np.pi)  # radius per angle
+        # arc length of r = pitch angle, inverted on a fine table
+        last = self.radius_m / pitch
+        angle = np.linspace(0.0, last, 16 + int(40 * last))
+        length = pitch / 2 * (angle * np.sqrt(1 + angle**2) + np.arcsinh(angle))
+        steps = np.arange(0.0, length[-1] + 1e-9 * spacing_m, spacing_m)
+        turned = np.interp(steps, length, angle)
+        offset = pitch * turned[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+        return flat(self.center_m + offset)
 
 
 @dataclass(frozen=True, eq=False)

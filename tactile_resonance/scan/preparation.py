@@ -23,7 +23,7 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
-from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.scan.clearance import TipUse, clear_points
 from tactile_resonance.scan.hands import PointDisturbed, PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.measurement import Skipped
 from tactile_resonance.scan.plan import Plan, make_plan
@@ -87,7 +87,11 @@ def prepare(
         use = tip_use()
         if use is None:
             plan = replace(plan, left_out=(UNCHECKED, *plan.left_out))
-    plan = plan.clear_of(surface, use)
+
+    def clear(plan: Plan) -> Plan:
+        return plan if use is None else plan.with_points(*clear_points(plan.points, surface, use))
+
+    plan = clear(plan)
     asked = scene.normals
     if asked is None:
         return plan, facts
@@ -103,8 +107,7 @@ def prepare(
     except (PointFailed, ScanEnded) as error:
         raise ValueError(f"normals: {error}") from error
     facts["normals"] = normals
-    plan = plan.with_points(points, left)
-    return plan.clear_of(surface, use), facts
+    return clear(plan.with_points(points, left)), facts
 
 
 def find_normals(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -86,10 +86,7 @@ class TouchedSurface(Surface):
         spare = len(touches) - self.coefficients_m.size
         return {
             "form": self.form,
-            "touches": [
-                {"ball_m": list(touch.ball_m), "std_m": touch.std_m, "force_n": touch.force_n}
-                for touch in touches
-            ],
+            "touches": [asdict(touch) for touch in touches],
             "residuals_m": self.residuals_m.tolist(),
             "consistent": self.consistent if spare else None,
             "center_m": self.center_m.tolist(),
@@ -98,9 +95,7 @@ class TouchedSurface(Surface):
         }
 
     def _basis(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Terms (..., k) and their derivatives by x and y [1/m]."""
-        x, y = np.moveaxis((np.asarray(xy_m, float) - self.center_m) / self.scale_m, -1, 0)
-        return _basis(x, y, self.form, self.scale_m)
+        return _basis(xy_m, self.form, self.center_m, self.scale_m)
 
 
 def fit_surface(
@@ -133,8 +128,7 @@ def fit_surface(
     center = contacts[:, :2].mean(axis=0)
     scale = float(np.max(np.abs(contacts[:, :2] - center)))
     require(scale > 0, "contacts_m", "one position", "positions apart from each other")
-    x, y = ((contacts[:, :2] - center) / scale).T
-    design = _basis(x, y, form, scale)[0] / std[:, None]  # (n, terms)
+    design = _basis(contacts[:, :2], form, center, scale)[0] / std[:, None]  # (n, terms)
     condition = float(np.linalg.cond(design * np.median(std)))
     require(
         condition < _WORST_CONDITION,
@@ -156,8 +150,10 @@ def fit_surface(
 
 
 def _basis(
-    x: FloatArray, y: FloatArray, form: str, scale_m: float
+    xy_m: npt.ArrayLike, form: str, center_m: FloatArray, scale_m: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Terms (..., k) and their derivatives by x and y [1/m]."""
+    x, y = np.moveaxis((np.asarray(xy_m, float) - center_m) / scale_m, -1, 0)
     zero, one = np.zeros_like(x), np.ones_like(x)
     value, by_x, by_y = [one, x, y], [zero, one, zero], [zero, zero, one]
     if form == "quadric":

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tactile_resonance.fields import known, require
+from tactile_resonance.fields import check_above_zero, known, require
 from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.mechanics.indentation import IndentationRecord, Protocol
 from tactile_resonance.recording.messages import indentation_from_message
@@ -63,9 +63,7 @@ class ProtocolRequest:
         drawn = self.kind is Protocol.INDENTATION
         good = 0 < self.hold_s <= 3600 or (drawn and self.hold_s == 0)
         require(good, "hold_s", self.hold_s, "above 0, at most 3600 (0 only for an indentation)")
-        for name in ("force_n", "press_speed_m_s", "unload_speed_m_s"):
-            value = getattr(self, name)
-            require(value is None or 0 < value < math.inf, name, value, "a number above 0")
+        check_above_zero(self, "force_n", "press_speed_m_s", "unload_speed_m_s")
         alone = self.unload_speed_m_s is None or drawn
         require(alone, "unload_speed_m_s", self.unload_speed_m_s, f"none with {self.kind.value}")
         if drawn and self.unload_speed_m_s is None:

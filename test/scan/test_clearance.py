@@ -37,7 +37,7 @@ def planned(surface, xy, use=None, heading_rad=0.0):
     sensor = SensorUse(heading_rad=heading_rad)
     scene = ScanScene("test", 0.01, positions, surface=surface, sensor=sensor)
     plan = make_plan(scene)
-    return plan if use is None else plan.clear_of(surface, use)
+    return plan if use is None else plan.with_points(*clear_points(plan.points, surface, use))
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.4, -0.3)])

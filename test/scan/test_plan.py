@@ -24,7 +24,6 @@ from tactile_resonance.scan.points import (
     grid,
     inside_polygon,
     read_positions,
-    spiral,
     tip_orientation,
 )
 from tactile_resonance.scan.scene import Output, ScanScene
@@ -48,7 +47,8 @@ def test_serpentine_visits_the_grid_by_shortest_steps():
 
 
 def test_spiral_covers_its_disc_evenly():
-    points = spiral([0.01, 0.02], 0.02, 0.002)
+    asked = {"center_m": [0.01, 0.02], "radius_m": 0.02, "spacing_m": 0.002}
+    points = read_positions({"spiral": asked}, "positions")[:, :2]
     distance = np.linalg.norm(points - [0.01, 0.02], axis=1)
     assert distance.max() <= 0.02
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
