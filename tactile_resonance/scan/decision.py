@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import check_above_zero, check_within, require
@@ -210,44 +209,34 @@ def decide(
         mode = poles.main
         at = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
         noise = mode.noise if np.all(np.isfinite(mode.noise)) else mode.covariance
-        return decide_mode(at.compared, at.covariance, noise, blocks, wanted, limits, block_s)
-    of_bands = [
-        decide_mode(mode.estimate, mode.covariance, mode.noise, blocks, wanted, limits, block_s)
-        for mode in (band.main for band in poles.bands)
-    ]
-    imprecise = [each for each in of_bands if each.verdict is not Verdict.PRECISE] or of_bands
-    return next((each for each in imprecise if not each.stop), imprecise[0])
+        modes = [(at.compared, at.covariance, noise)]
+    else:
+        mains = (band.main for band in poles.bands)
+        modes = [(mode.estimate, mode.covariance, mode.noise) for mode in mains]
+    found = [_verdict(*mode, blocks, wanted, limits) for mode in modes]
+    imprecise = [each for each in found if each[0] is not Verdict.PRECISE] or found
+    undecided = (each for each in imprecise if each[0] is Verdict.CONTINUE)
+    verdict, called = next(undecided, imprecise[0])
+    saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
+    return Decision(verdict, blocks, saved, saved * block_s, called)
 
 
-def decide_mode(
-    estimate: npt.ArrayLike,
-    covariance: npt.ArrayLike,
-    noise: npt.ArrayLike,
+def _verdict(
+    estimate: FloatArray,
+    covariance: FloatArray,
+    noise: FloatArray,
     blocks: int,
     wanted: Precise | Separate | None,
     limits: BlockLimits,
-    block_s: float,
-) -> Decision:
-    """`decide` of one mode.
-
-    Parameters
-    ----------
-    estimate : (2,) float
-        f0 [Hz] and damping ratio from all blocks so far; NaN where there is none yet.
-    covariance, noise : (2, 2) float
-        Of the estimate, as of `Poles.main`: the best one known, and what of it is noise; NaN where unknown.
-    blocks, wanted, limits, block_s
-        As `decide`.
-    """
-    x, best, of_noise = (np.asarray(each, float) for each in (estimate, covariance, noise))
+) -> tuple[Verdict, str]:
+    """Of one mode, of which nothing may be known yet: verdict and class."""
     verdict, called = Verdict.CONTINUE, ""
-    known = np.all(np.isfinite(best)) and np.all(np.isfinite(x))
+    known = np.all(np.isfinite(covariance)) and np.all(np.isfinite(estimate))
     if blocks >= limits.least and wanted is not None and known:
-        verdict, called = wanted.verdict(x, best, of_noise, blocks, limits)
+        verdict, called = wanted.verdict(estimate, covariance, noise, blocks, limits)
     if verdict is Verdict.CONTINUE and blocks >= limits.most:
         verdict = Verdict.MOST_BLOCKS
-    saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
-    return Decision(verdict, blocks, saved, saved * block_s, called)
+    return verdict, called
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.record import Contact, Origin
-from tactile_resonance.scan.decision import decide_mode
+from tactile_resonance.scan.decision import decide
 from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_outcome import attempt_at, measured_result
@@ -18,6 +18,7 @@ from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
+from tactile_resonance.tissue.nominal_contact import ContactLoad
 
 START_NS = 1_700_000_000_000_000_000
 AGE_S = 1.0  # of contacts of the bench that do not creep
@@ -69,15 +70,8 @@ def measure(scene, phantoms, design, bench, point, attempt):
             harmonics=excitation.harmonics,
             band_hz=band,
         )
-        decision = decide_mode(
-            poles.main.estimate,
-            poles.main.covariance,
-            poles.main.noise,
-            len(u),
-            scene.precision,
-            scene.blocks,
-            design.block_s,
-        )
+        asked = len(u), scene.precision, scene.blocks, design.block_s
+        decision = decide(poles, ContactLoad(), None, *asked)
         if decision.stop:
             break
     contact = Contact(

@@ -14,7 +14,6 @@ from tactile_resonance.scan.decision import (
     Separate,
     Verdict,
     decide,
-    decide_mode,
 )
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import (
@@ -26,6 +25,14 @@ from tactile_resonance.tissue.nominal_contact import (
 # of one block
 BLOCK = np.array([[0.02**2, 0.2 * 0.02 * 8e-5], [0.2 * 0.02 * 8e-5, 8e-5**2]])
 LIMITS = BlockLimits(least=1, most=200)
+
+
+def decide_mode(estimate, covariance, noise, *asked):
+    """`decide` of a measurement with one mode, compared as it is."""
+    nothing = np.full(2, np.nan)
+    mode = MainMode(np.array(estimate), covariance, noise, -50 + 1600j, nothing, nothing)
+    poles = SimpleNamespace(main=mode, bands=[SimpleNamespace(main=mode)])
+    return decide(poles, ContactLoad(), None, *asked)
 
 
 def point_classes(distance, spread=None):
