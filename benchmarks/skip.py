@@ -15,8 +15,8 @@ from benchmarks import skip_decision, skip_time, skip_touches
 from benchmarks.skip_hands import Scanned, scan
 from tactile_resonance.configuration import share_path
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
-from tactile_resonance.scan.adaptive import Adaptive, WantedBoundary, known_points
-from tactile_resonance.scan.level_set import difference_m2
+from tactile_resonance.scan.adaptive import Adaptive, known_points
+from tactile_resonance.scan.level_set import LevelSet, difference_m2
 from tactile_resonance.strict_yaml import parse_yaml
 
 Content = Mapping[str, Any]
@@ -250,11 +250,11 @@ def _error(done: Scanned, asked: Adaptive | None) -> str:
     place_m = np.array([result.position_m[:2] for result in results])
     off_hz = np.array([result.f0_hz for result in results]) - done.true_f0_hz(place_m)
     text = f"{1e3 * np.sqrt(np.mean(off_hz**2)):.0f} mHz"
-    if asked is not None and isinstance(asked.wanted, WantedBoundary):
+    if asked is not None and isinstance(asked.wanted, LevelSet):
         surface = asked.krige(known_points(results))
         assert surface is not None
         truth = done.true_f0_hz(asked.raster.xy_m)
-        wrong_m2 = difference_m2(surface, asked.wanted.level_set, asked.raster, truth)
+        wrong_m2 = difference_m2(surface, asked.wanted, asked.raster, truth)
         text += f", {1e6 * wrong_m2:.1f} mm2"
     return text + (f", {missing} points without poles" if missing else "")
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
-from tactile_resonance.scan.adaptive import Adaptive, WantedBoundary
+from tactile_resonance.scan.adaptive import Adaptive
 from tactile_resonance.scan.clearance import NEAR_M
 from tactile_resonance.scan.kriging import KrigedSurface, krige
 from tactile_resonance.scan.level_set import LevelSet, difference_m2
@@ -38,8 +38,8 @@ MEASURE_S = 0.8
 """Two blocks, as the demo's points take."""
 SQUARE = SIDE_M / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 ASKED = Adaptive(
-    *(SQUARE, WantedBoundary(LevelSet(low=LEVEL_HZ), WANTED_M2)),
-    *(MOST, SMALLEST_M, START, SPACING_M),
+    *(SQUARE, LevelSet(low=LEVEL_HZ), MOST, SMALLEST_M),
+    *(START, SPACING_M, WANTED_M2),
 )
 
 
@@ -173,7 +173,7 @@ def _measured(phantom: Phantom, xy_m: FloatArray, rng: np.random.Generator) -> F
 def _areas(phantom: Phantom, surface: KrigedSurface) -> tuple[float, float]:
     """Off the truth, and as expected [m^2]."""
     raster = ASKED.raster
-    off_m2 = difference_m2(surface, ASKED.wanted.level_set, raster, phantom.f0_hz(raster.xy_m))
+    off_m2 = difference_m2(surface, ASKED.wanted, raster, phantom.f0_hz(raster.xy_m))
     return off_m2, ASKED.loss(surface)
 
 

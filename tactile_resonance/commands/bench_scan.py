@@ -208,7 +208,7 @@ def run_job(job: Job) -> int:
     from tactile_resonance.client import Ending
     from tactile_resonance.commands import report
     from tactile_resonance.commands.plan import read_phantoms
-    from tactile_resonance.scan.adaptive import WantedBoundary
+    from tactile_resonance.scan.level_set import LevelSet
     from tactile_resonance.scan.plan import make_plan
     from tactile_resonance.scan.run_directory import RunDirectory
     from tactile_resonance.scan.scene import read_scan_scene
@@ -237,7 +237,7 @@ def run_job(job: Job) -> int:
     work = job.output.with_name(job.output.name + ".work")
     parameters = node_parameters(job, bool(content.tissue_classes), work, content.frame_id)
     parameters["pole_map_node"]["unknown_level"] = content.unknown_level
-    if content.adaptive is not None and isinstance(content.adaptive.wanted, WantedBoundary):
+    if content.adaptive is not None and isinstance(content.adaptive.wanted, LevelSet):
         parameters["pole_map_node"]["adaptive_scene"] = str(job.scene)
     computing = () if priority or not job.real_time else COMPUTING
     try:

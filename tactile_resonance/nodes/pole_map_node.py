@@ -21,7 +21,6 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, pose_of, values
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.scan.adaptive import WantedBoundary
 from tactile_resonance.scan.level_set import Boundary, LevelSet
 from tactile_resonance.scan.map_messages import (
     boundary_markers,
@@ -338,7 +337,7 @@ def _boundary_of(
     where = "adaptive_scene"
     require(wanted is None, where, scene, "empty where boundary_f0_hz is given")
     adaptive = read_scan_scene(shared_file(Path(scene), "config/scenes")).adaptive
-    if adaptive is None or not isinstance(adaptive.wanted, WantedBoundary):
+    if adaptive is None or not isinstance(adaptive.wanted, LevelSet):
         accepted = "a scene with adaptive positions that look for a boundary or a tissue"
         raise ValueError(f"{where}: got {scene}; accepted is {accepted}")
     return lambda pole_map: adaptive.boundary(pole_map.placed)

@@ -92,7 +92,7 @@ def boundary_of_run(run: RunContent) -> RunBoundary | None:
     if scene is None or asked is None or boundary is None:
         return None
     frame_id = run.latest[0].frame_id or scene.frame_id
-    found = RunBoundary(boundary, asked.wanted.most_loss, len(run.latest), frame_id)
+    found = RunBoundary(boundary, asked.most_loss, len(run.latest), frame_id)
     if not any(result.simulated for result in run.latest):
         return found
     try:

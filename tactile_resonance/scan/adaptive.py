@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -50,35 +50,10 @@ _STEPS = 50  # in which the first touches are spread
 
 
 @dataclass(frozen=True)
-class WantedBoundary:
-    """Wanted: where f0 lies between two levels, up to an expected area on the wrong side."""
-
-    level_set: LevelSet
-    most_loss: float  # [m^2]
-
-    def loss(self, f0_hz: FloatArray, std_hz: FloatArray) -> FloatArray:
-        """(...) per area."""
-        return self.level_set.wrong(f0_hz, std_hz)
-
-    def loss_after(self, f0_hz: FloatArray, std_hz: FloatArray, after: FloatArray) -> FloatArray:
-        """(...) as it is expected after a touch that leaves another standard deviation."""
-        return self.level_set.wrong_after(f0_hz, std_hz, after)
-
-    def doubt(self, f0_hz: FloatArray, std_hz: FloatArray) -> FloatArray:
-        """(...) how little is known of places: the straddle heuristic (Bryan et al., NIPS 18, 2005)."""
-        return 1.96 * std_hz - np.abs(self.level_set.depth(f0_hz))
-
-    def least_std(self, values: FloatArray) -> float:
-        """Of the process: the mean is at most one of them from a level [Hz]."""
-        return float(np.min(np.abs(np.array(self.level_set.levels) - values.mean())))
-
-
-@dataclass(frozen=True)
 class WantedMap:
     """Wanted: f0 everywhere with this standard deviation; the loss is the variance above it."""
 
     f0_std_hz: float
-    most_loss: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         check_above_zero(self, "f0_std_hz")
@@ -108,21 +83,25 @@ class Adaptive:
     ----------
     polygon_m : (k, 2) float
         Corners of the region.
-    wanted : WantedBoundary or WantedMap
+    wanted : LevelSet or WantedMap
+        Where f0 lies between two levels, or all of it.
     most, start : int
         All touches, and the first ones.
     smallest_m : float
         Width of the smallest thing that is looked for.
     spacing_m : float
         Of the grid of places that may be touched.
+    most_loss : float
+        Expected area on the wrong side that may be left [m^2]; of a map nothing is.
     """
 
     polygon_m: FloatArray
-    wanted: WantedBoundary | WantedMap
+    wanted: LevelSet | WantedMap
     most: int
     smallest_m: float
     start: int = 9
     spacing_m: float = 0.001
+    most_loss: float = 0.0
 
     def __post_init__(self) -> None:
         check_above_zero(self, "spacing_m", "smallest_m")
@@ -132,11 +111,6 @@ class Adaptive:
     def raster(self) -> Raster:
         """Of the region, fine enough for areas."""
         return self._raster(CELLS)
-
-    @cached_property
-    def _coarse(self) -> Raster:
-        """Of the region, for what a touch gains."""
-        return self._raster(CELLS // 2)
 
     def _raster(self, cells: int) -> Raster:
         longest_m = float(np.max(np.ptp(self.polygon_m, axis=0)))
@@ -180,10 +154,10 @@ class Adaptive:
 
     def boundary(self, results: Iterable[PointResult]) -> Boundary | None:
         """Boundary that the points of a scan lead to; None where none is wanted, or they are too few."""
-        if not isinstance(self.wanted, WantedBoundary):
+        if not isinstance(self.wanted, LevelSet):
             return None
         surface = self.krige(known_points(results))
-        return None if surface is None else boundary_of(surface, self.wanted.level_set, self.raster)
+        return None if surface is None else boundary_of(surface, self.wanted, self.raster)
 
     def next(
         self,
@@ -210,7 +184,7 @@ class Adaptive:
         surface = self.krige(known)
         if surface is None:  # points failed: the place farthest from all of them
             gain = cdist(places_m[free], places_m[list(touched)]).min(axis=1)
-        elif self.loss(surface) <= self.wanted.most_loss:
+        elif self.loss(surface) <= self.most_loss:
             return None
         else:
             doubt = np.round(self.wanted.doubt(*surface.predict(places_m[free])), 9)
@@ -230,7 +204,8 @@ class Adaptive:
         By the likeliest length and size alone: to choose, that does, and costs a tenth.
         """
         process = surface.likeliest
-        at = self._coarse.xy_m[self._coarse.within]
+        coarse = self._raster(CELLS // 2)
+        at = coarse.xy_m[coarse.within]
         f0_hz, variance = process.moments(at)
         std_hz = np.sqrt(variance)
         before = self.wanted.loss(f0_hz, std_hz)
@@ -274,16 +249,18 @@ def read_adaptive(value: Mapping[str, Any], classes: Sequence[TissueClass], wher
     ValueError
         That names the field, its value and what is accepted.
     """
-    own = {field.name for field in fields(Adaptive)} - {"polygon_m", "wanted"}
+    own = {field.name for field in fields(Adaptive)} - {"polygon_m", "wanted", "most_loss"}
     beside = {*own, *(field.name for field in fields(_Within))}
     value = {key: item for key, item in value.items() if item is not None}
     _, wanted = one_of(_WANTED, value, where, frozenset(beside))
+    most_loss = 0.0
     if not isinstance(wanted, WantedMap):
         means = {each.name: float(each.mean[0]) for each in classes}
-        wanted = WantedBoundary(build(wanted.level_set, where, means), wanted.area_m2)
+        wanted, most_loss = build(wanted.level_set, where, means), wanted.area_m2
     region, rest = ({k: v for k, v in value.items() if k in keys} for keys in (beside - own, own))
     polygon_m = build(read_dataclass(_Within, region, where).polygon, where)
-    made = read_dataclass(Adaptive, rest, where, polygon_m=polygon_m, wanted=wanted)
+    given = {"polygon_m": polygon_m, "wanted": wanted, "most_loss": most_loss}
+    made = read_dataclass(Adaptive, rest, where, **given)
     build(made.places_m, where)
     return made
 

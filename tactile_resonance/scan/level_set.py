@@ -58,12 +58,12 @@ class LevelSet:
         std = np.maximum(std, np.finfo(float).tiny)
         return np.asarray(ndtr((self.high - value) / std) - ndtr((self.low - value) / std))
 
-    def wrong(self, value: FloatArray, std: FloatArray) -> FloatArray:
+    def loss(self, value: FloatArray, std: FloatArray) -> FloatArray:
         """(...) probability that a place is taken to lie on the wrong side."""
         inside = self.inside(value, std)
         return np.where(self.depth(value) > 0, 1 - inside, inside)
 
-    def wrong_after(self, value: FloatArray, std: FloatArray, after: FloatArray) -> FloatArray:
+    def loss_after(self, value: FloatArray, std: FloatArray, after: FloatArray) -> FloatArray:
         """(...) as it is expected after a touch that leaves the standard deviation `after`."""
         with np.errstate(divide="ignore"):
             ratio = after / np.sqrt(np.maximum(std**2 - after**2, 0))
@@ -74,6 +74,14 @@ class LevelSet:
             sign = np.where(self.depth(value) > 0, 1, -1)
             wrong = wrong + sign * owens_t(np.maximum(low, high) / std, ratio)
         return np.asarray(2 * wrong)
+
+    def doubt(self, value: FloatArray, std: FloatArray) -> FloatArray:
+        """(...) how little is known of places: the straddle heuristic (Bryan et al., NIPS 18, 2005)."""
+        return 1.96 * std - np.abs(self.depth(value))
+
+    def least_std(self, values: FloatArray) -> float:
+        """Of the process: the mean is at most one of them from a level."""
+        return float(np.min(np.abs(np.array(self.levels) - values.mean())))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,5 +194,5 @@ def boundary_of(surface: KrigedSurface | TiledSurface, level_set: LevelSet, rast
         raster.lines(depth + reach),
         float(np.sum(inside)) * cell_m2,
         float(np.sum(np.sqrt(inside * (1 - inside)))) * cell_m2,
-        float(np.sum(level_set.wrong(value, std)[raster.within])) * cell_m2,
+        float(np.sum(level_set.loss(value, std)[raster.within])) * cell_m2,
     )

@@ -100,8 +100,8 @@ def adaptive_wanted(asked: Adaptive) -> str:
     wanted = asked.wanted
     if isinstance(wanted, WantedMap):
         return f"f0 +- {wanted.f0_std_hz:g} Hz everywhere"
-    levels = " and ".join(f"{level:.2f}" for level in wanted.level_set.levels)
-    return f"the boundary at {levels} Hz with {1e6 * wanted.most_loss:.3g} mm2 expected on its wrong side"
+    levels = " and ".join(f"{level:.2f}" for level in wanted.levels)
+    return f"the boundary at {levels} Hz with {1e6 * asked.most_loss:.3g} mm2 expected on its wrong side"
 
 
 def _found(asked: Adaptive, results: Sequence[PointResult]) -> str:
@@ -110,7 +110,7 @@ def _found(asked: Adaptive, results: Sequence[PointResult]) -> str:
     if surface is None:
         return "too few points have a pole"
     loss = asked.loss(surface)
-    met = "enough" if loss <= asked.wanted.most_loss else "not enough"
+    met = "enough" if loss <= asked.most_loss else "not enough"
     if isinstance(asked.wanted, WantedMap):
         _, std_hz = surface.predict(asked.raster.xy_m[asked.raster.within])
         return f"{met}: +- {std_hz.max():.2g} Hz at most, {counted(len(results), 'touch', 'touches')}"

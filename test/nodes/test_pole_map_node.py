@@ -577,7 +577,7 @@ def test_the_boundary_of_an_adaptive_scan_is_that_of_its_report():
     """Also where no point lies: over the whole region of the scene."""
     path = share_path("config/scenes/demo.yaml")
     arguments = [*OF_POLES, "-p", f"adaptive_scene:={path}"]
-    level_hz, results = read_scan_scene(path).adaptive.wanted.level_set.levels[0], []
+    level_hz, results = read_scan_scene(path).adaptive.wanted.levels[0], []
     with initialised(domain_id=free_domain_id(os.environ), args=arguments), Bench() as bench:
         for k, y_m in enumerate((-0.002, 0.002)):
             for j, x_m in enumerate(np.linspace(-0.006, 0.006, 5)):

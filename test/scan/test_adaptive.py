@@ -82,7 +82,7 @@ def touched(asked, f0_hz, std_hz=0.02, seed=1, known=()):
 
 def wrong_m2(asked, found, f0_hz):
     raster = asked.raster
-    return difference_m2(asked.krige(found), asked.wanted.level_set, raster, f0_hz(raster.xy_m))
+    return difference_m2(asked.krige(found), asked.wanted, raster, f0_hz(raster.xy_m))
 
 
 def covered(asked, found, phantom):
@@ -125,7 +125,7 @@ def test_touches_lie_in_the_polygon(tmp_path):
     assert np.all(xy.sum(axis=1) <= 0.02 + 1e-9)
     # the boundary is a straight line, from edge to edge
     surface = read.adaptive.krige((xy, *rest))
-    (line,) = boundary_of(surface, read.adaptive.wanted.level_set, read.adaptive.raster).outline_m
+    (line,) = boundary_of(surface, read.adaptive.wanted, read.adaptive.raster).outline_m
     np.testing.assert_allclose(line[:, 0], 0.0075, atol=2e-4)
     assert np.ptp(line[:, 1]) == pytest.approx(0.0125, abs=1e-3)
 
@@ -211,11 +211,9 @@ def test_a_map_is_as_exact_everywhere_as_it_was_asked_for(tmp_path):
 
 def test_a_tissue_lies_between_the_middles_of_its_neighbours(tmp_path):
     for name, ends in {"a": (-np.inf, 256.0), "b": (256.0, 260.5), "c": (260.5, np.inf)}.items():
-        level_set = scene(
-            tmp_path, tissue={"name": name, "area_m2": 1e-6}
-        ).adaptive.wanted.level_set
+        level_set = scene(tmp_path, tissue={"name": name, "area_m2": 1e-6}).adaptive.wanted
         assert (level_set.low, level_set.high) == ends
-    level = scene(tmp_path, boundary={"f0_hz": 255.5, "area_m2": 1e-6}).adaptive.wanted.level_set
+    level = scene(tmp_path, boundary={"f0_hz": 255.5, "area_m2": 1e-6}).adaptive.wanted
     assert level.levels == (255.5,)
 
 

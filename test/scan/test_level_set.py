@@ -16,7 +16,7 @@ SQUARE = np.array([[-0.01, -0.01], [0.01, -0.01], [0.01, 0.01], [-0.01, 0.01]])
 def test_a_place_is_on_the_wrong_side_as_often_as_stated():
     above = LevelSet(low=255.0)
     value, std = np.array([254.0, 255.0, 256.5]), np.array([1.0, 0.3, 0.5])
-    np.testing.assert_allclose(above.wrong(value, std), norm.cdf(-np.abs(value - 255.0) / std))
+    np.testing.assert_allclose(above.loss(value, std), norm.cdf(-np.abs(value - 255.0) / std))
     np.testing.assert_allclose(above.inside(value, std), norm.sf(255.0, value, std))
     between = LevelSet(254.0, 256.0)
     value = np.array([253.0, 255.0, 256.1])
@@ -24,7 +24,7 @@ def test_a_place_is_on_the_wrong_side_as_often_as_stated():
     np.testing.assert_allclose(between.inside(value, np.full(3, 0.5)), inside)
     np.testing.assert_array_equal(between.depth(value) > 0, [False, True, False])
     np.testing.assert_allclose(
-        between.wrong(value, np.full(3, 0.5)), [inside[0], 1 - inside[1], inside[2]]
+        between.loss(value, np.full(3, 0.5)), [inside[0], 1 - inside[1], inside[2]]
     )
 
 
@@ -34,7 +34,7 @@ def test_a_narrow_band_is_wrong_as_often_as_stated_where_little_is_known():
     band, value, std = LevelSet(254.0, 256.0), np.array([255.3, 253.0]), np.array([3.0, 3.0])
     truth = value[:, None] + std[:, None] * rng.standard_normal((2, runs))
     drawn = np.mean((band.depth(truth) > 0) != (band.depth(value) > 0)[:, None], axis=1)
-    stated = band.wrong(value, std)
+    stated = band.loss(value, std)
     assert np.all(np.abs(drawn - stated) < 4 * np.sqrt(stated * (1 - stated) / runs))
     assert stated[0] > 0.7
 
@@ -48,15 +48,15 @@ def test_after_a_touch_it_is_wrong_as_often_as_was_expected(value, std, after):
     estimate = value + np.sqrt(std**2 - after**2) * rng.standard_normal(runs)
     truth = estimate + after * rng.standard_normal(runs)
     drawn = np.mean((estimate > 0) != (truth > 0))
-    stated = LevelSet(low=0.0).wrong_after(*(np.array([v]) for v in (value, std, after)))[0]
+    stated = LevelSet(low=0.0).loss_after(*(np.array([v]) for v in (value, std, after)))[0]
     assert abs(drawn - stated) < 4 * np.sqrt(stated * (1 - stated) / runs)
 
 
 def test_a_touch_that_shows_nothing_changes_nothing_and_an_exact_one_ends_all_doubt():
     above, value, std = LevelSet(low=255.0), np.array([254.0, 255.2]), np.array([1.0, 0.3])
     for wanted in (above, LevelSet(253.8, 255.0), LevelSet(255.0, 255.5), LevelSet(high=255.0)):
-        np.testing.assert_allclose(wanted.wrong_after(value, std, std), wanted.wrong(value, std))
-        np.testing.assert_allclose(wanted.wrong_after(value, std, 0 * std), 0, atol=1e-15)
+        np.testing.assert_allclose(wanted.loss_after(value, std, std), wanted.loss(value, std))
+        np.testing.assert_allclose(wanted.loss_after(value, std, 0 * std), 0, atol=1e-15)
 
 
 def cone(xy, radius=0.005, slope_hz_per_m=800.0):
