@@ -280,10 +280,10 @@ def band_results(poles: Poles) -> tuple[BandResult, ...]:
 class ResultsFile:
     """``results.csv`` as it grows: a row is appended where it can be, else all are written anew.
 
-    Numbers stand with all their digits, unknown ones are ``nan``. Where a result has them, columns for the poles
-    of further bands, numbered from ``f0_hz_2``, and for the distortion in each band, ``distortion_even_db``,
-    ``distortion_even_db_2``, ..., follow the others. A text that a spreadsheet would take for a formula begins
-    with an apostrophe.
+    Numbers stand with all their digits, unknown ones are ``nan``. Where a result has them, columns for the
+    poles of further bands, numbered from ``f0_hz_2``, and for the distortion in each band,
+    ``distortion_even_db``, ``distortion_even_db_2``, ..., follow the others. A text that a spreadsheet would
+    take for a formula begins with an apostrophe.
 
     Parameters
     ----------

@@ -253,7 +253,7 @@ class _Spiral:
     spacing_m: Spacing
 
     def positions(self) -> FloatArray:
-        """Of an Archimedean one, outwards; neighbours along it and from turn to turn lie about a spacing apart."""
+        """Of an Archimedean one, outwards: neighbours along it and from turn to turn about a spacing apart."""
         check_above_zero(self, "radius_m")
         spacing_m = self.spacing_m[0]
         _check_count(np.pi * (self.radius_m / spacing_m) ** 2)

@@ -117,7 +117,7 @@ def find_normals(
     heading_rad: float,
     touch: Callable[[ScanPoint], Touch],
 ) -> tuple[list[ScanPoint], list[dict[str, Any]], list[LeftOut]]:
-    """Touch around each point: `normal_of_touches`; those whose normal is not found, or is refused, are left out.
+    """`normal_of_touches` about each point; those whose normal is not found, or is refused, are left out.
 
     Parameters
     ----------
@@ -182,8 +182,8 @@ def normal_of_touches(
         With the normal found, where the ball touches the surface when it is straight above the point that was
         asked for: beside that by the ball's radius times the sine of the angle.
     facts : dict
-        What a run keeps of it [m, rad]: the angle from the normal that was expected, the standard deviation about
-        the axis about which the normal is known least, the largest distance of a touch from the plane.
+        What a run keeps of it [m, rad]: the angle from the normal that was expected, the standard deviation
+        about the axis about which the normal is known least, the largest distance of a touch from the plane.
 
     Raises
     ------
