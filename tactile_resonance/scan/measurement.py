@@ -115,7 +115,8 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     Raises
     ------
     ValueError
-        If a band does not lie within what can be excited, or holds too few lines for its model.
+        If a band does not lie within what can be excited, or holds too few lines for its model, or the scene
+        wants what the short blocks of a calibrated sensor do not hold.
     """
     use, outputs = scene.sensor, set(scene.outputs)
     top_hz = min(F_MAX_HZ, MOST_OF_RATE * use.sample_rate_hz)
@@ -125,8 +126,7 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
                 f"sensor: got the band {band.low_hz:g} to {band.high_hz:g} Hz; accepted is within "
                 f"{F_MIN_HZ:g} to {top_hz:g} Hz"
             )
-    if use.calibrated:
-        return _design_calibrated(scene, top_hz)
+    air = _design_in_air(scene) if use.calibrated else None
     whole_hz = ((F_MIN_HZ, top_hz),)
     # even distortion of a band falls outside of it: what is to show there must be excited there
     distortion = Output.DISTORTION in outputs
@@ -134,7 +134,9 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     samples, margin = use.samples_per_period, MARGIN_LINES
     # a gate judges how the force of a block moved
     least_s = 0.0 if scene.gate is None else SHORTEST_S
-    if samples is None:
+    if use.calibrated:
+        samples, margin = samples or math.ceil(CALIBRATED_S * use.sample_rate_hz), 0
+    elif samples is None:
         samples, margin = shortest_samples(use.bands, use.sample_rate_hz, share, least_s), 0
     spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
     if block_s < least_s:
@@ -148,6 +150,8 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     lines = sum(lines_of(ends_hz, spacing_hz) for ends_hz in stretches_hz)
     for band in use.bands:
         fewest = ModelStructure.with_residual(band.order or 2, band.residual_terms).fewest_lines
+        if use.calibrated:
+            fewest = FEWEST_CALIBRATED - 1
         found = lines_of(band.ends_hz, spacing_hz, share)
         if found <= fewest:
             raise ValueError(
@@ -158,12 +162,13 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     if not distortion:
         skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
     if Output.SILENT not in outputs:
-        silent_s = _of_reference(blocks, block_s) * block_s
+        each_s = block_s if air is None else air.block_s
+        silent_s = _of_reference(blocks if air is None else air.blocks, each_s) * each_s
         skipped.append(Skipped("a silent record", "silent is not wanted", silent_s))
     if Output.MAP not in outputs:
         skipped.append(Skipped("pole_map.png and map.mcap", "no map is wanted"))
     return MeasurementDesign(
-        bands=use.bands,
+        bands=use.bands if air is None else air.bands,
         stretches_hz=stretches_hz,
         grid=Grid.ODD_RANDOM if distortion else Grid.FULL,
         level_v=_level_v(use, lines, spacing_hz),
@@ -173,18 +178,13 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         periods=blocks.most,
         lines=lines,
         skipped=tuple(skipped),
-        sweep=use.samples_per_period is None and not distortion,
+        sweep=use.calibrated or (use.samples_per_period is None and not distortion),
+        air=air,
     )
 
 
-def _design_calibrated(scene: ScanScene, top_hz: float) -> MeasurementDesign:
-    """Short blocks for poles through a calibrated sensor; in air as without one.
-
-    Raises
-    ------
-    ValueError
-        If the scene wants what such blocks do not hold.
-    """
+def _design_in_air(scene: ScanScene) -> MeasurementDesign:
+    """Of a calibrated sensor, as without a calibration; ValueError where its short blocks do not do."""
     use = scene.sensor
     wanted = [output.value for output in scene.outputs if output in (Output.DISTORTION, Output.FRF)]
     accepted = "none of distortion, frf with sensor.calibrated: only lines of the band are excited"
@@ -195,30 +195,7 @@ def _design_calibrated(scene: ScanScene, top_hz: float) -> MeasurementDesign:
     accepted = "none with sensor.calibrated, whose blocks are too short for it"
     require(scene.gate is None, "gate", scene.gate, accepted)
     plain = replace(use, calibrated=False, samples_per_period=None)
-    air = design_measurement(replace(scene, sensor=plain, blocks=None))
-    samples = use.samples_per_period or math.ceil(CALIBRATED_S * use.sample_rate_hz)
-    spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
-    ends_hz = use.bands[0].ends_hz
-    lines = lines_of(ends_hz, spacing_hz)
-    if lines < FEWEST_CALIBRATED:
-        raise ValueError(
-            f"sensor: got {lines} excited lines in the band {ends_hz[0]:g} to {ends_hz[1]:g} Hz, "
-            f"{spacing_hz:g} Hz apart; accepted is {FEWEST_CALIBRATED} or more"
-        )
-    least = 1 if isinstance(scene.precision, Separate) else BlockLimits().least
-    blocks = scene.blocks or BlockLimits(least, max(least, math.ceil(CALIBRATED_MOST_S / block_s)))
-    return replace(
-        air,
-        skipped=(_only_poles(use, lines, spacing_hz, top_hz), *air.skipped[1:]),
-        stretches_hz=(ends_hz,),
-        level_v=_level_v(use, lines, spacing_hz),
-        samples=samples,
-        blocks=blocks,
-        periods=blocks.most,
-        lines=lines,
-        sweep=True,
-        air=air,
-    )
+    return design_measurement(replace(scene, sensor=plain, blocks=None))
 
 
 def _only_poles(use: SensorUse, lines: int, spacing_hz: float, top_hz: float) -> Skipped:
@@ -264,10 +241,12 @@ def _stretches(
 def _default_blocks(scene: ScanScene, block_s: float) -> BlockLimits:
     """Of a scene that says nothing; where the plan chooses the period, as many as take as long."""
     usual = BlockLimits()
-    if scene.sensor.samples_per_period is not None:
-        return usual
     # of two classes one block may tell; a precision is estimated too well by chance from the first
     least = 1 if isinstance(scene.precision, Separate) else usual.least
+    if scene.sensor.calibrated:
+        return BlockLimits(least, max(least, math.ceil(CALIBRATED_MOST_S / block_s)))
+    if scene.sensor.samples_per_period is not None:
+        return usual
     return BlockLimits(least, max(usual.most, math.ceil(MOST_S / block_s - 1e-9)))
 
 
