@@ -124,11 +124,12 @@ def _entries_of(path: Path) -> list[StoredEntry] | None:
     try:
         # only here: everything else works without the library for recordings
         from tactile_resonance.scan.recorded import run_entries
+        from tactile_resonance.scan.run_content import read_run
     except ImportError as error:
         raise ValueError(
             f"device: replay of a run: {error.name} not found; pip install rosbags"
         ) from error
-    return run_entries(path)
+    return run_entries(read_run(path))
 
 
 def open_store(

@@ -51,7 +51,8 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
     ValueError
         If it is not a run, or the measurement is not named or not there.
     """
-    content, entries = _entries(run)
+    content = read_run(run)
+    entries = run_entries(content)
     points = [entry for entry in entries if entry.path.name.startswith("point-")]
     among = points if measurement_id is None and len(points) == 1 else entries
     try:
@@ -62,22 +63,11 @@ def read_recorded(run: Path, measurement_id: int | None = None) -> StoredMeasure
         raise ValueError(f"{error}; left out: {'; '.join(content.problems)}") from error
 
 
-def run_entries(run: Path) -> list[StoredEntry]:
-    """The measurements of a run, in the order in which they were taken.
-
-    Raises
-    ------
-    ValueError
-        If it is no run.
-    """
-    return _entries(run)[1]
-
-
-def _entries(run: Path) -> tuple[RunContent, list[StoredEntry]]:
-    content = read_run(run)
-    return content, [
+def run_entries(run: RunContent) -> list[StoredEntry]:
+    """The measurements of a run, in the order in which they were taken."""
+    return [
         StoredEntry(key, path, partial(_read, path, key), _place_of(path))
-        for path in content.paths()
+        for path in run.paths()
         for key in _ids_of(path)
     ]
 
