@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
@@ -104,8 +105,7 @@ class Controls:
     """What is asked of a running scan, from any thread."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._request: Request | None = None
+        self._requests: deque[Request] = deque(maxlen=1)
         self.paused = threading.Event()
         self.cancelled = threading.Event()
 
@@ -114,19 +114,16 @@ class Controls:
         if request is Request.CANCEL:
             self.cancelled.set()
         else:
-            with self._lock:
-                self._request = request
+            self._requests.append(request)
 
     def take(self) -> Request | None:
         """Request that waits, once."""
-        with self._lock:
-            request, self._request = self._request, None
-        return request
+        return self._requests.pop() if self._requests else None
 
     def check(self) -> None:
         """Raise `Interrupted` where the point under way shall be left."""
         self.check_cancelled()
-        if self._request is not None:
+        if self._requests:
             raise Interrupted
 
     def check_cancelled(self) -> None:
