@@ -26,7 +26,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -152,17 +152,13 @@ class RunDirectory:
         cls.check_new(path, needed_bytes)
         text = _plan_text(RunContent(path, scene, facts, tuple(points), places=tuple(places)))
         (path / RECORDING).mkdir(parents=True)
-        lock = _lock(path)
-        try:
+        with _locked(path) as lock:
             write_whole(path / SCENE, scene.encode())
             write_entries(path, [entry_of(path / SCENE, SCENE)])
             write_whole(path / "run.json", text)  # last: with it the run exists
             sync(path)
             sync(path.parent)
             return cls(path, lock, read_run(path))
-        except BaseException:
-            os.close(lock)
-            raise
 
     @staticmethod
     def check_new(path: Path, needed_bytes: int) -> None:
@@ -193,8 +189,7 @@ class RunDirectory:
             are of another version: no reader takes two definitions of one type in one bag.
         """
         path = Path(path)
-        lock = _lock(path)
-        try:
+        with _locked(path) as lock:
             content = read_run(path)
             if PLAN_DAMAGED in content.problems:
                 raise ValueError(f"run: {path}: {PLAN_DAMAGED}: nobody knows where its points lie")
@@ -213,9 +208,6 @@ class RunDirectory:
                 part.unlink()
             _mend_index(path)
             return cls(path, lock, content)
-        except BaseException:
-            os.close(lock)
-            raise
 
     def __enter__(self) -> Self:
         return self
@@ -412,15 +404,19 @@ def _mend_index(path: Path) -> None:
     write_entries(path, entries.values())
 
 
-def _lock(path: Path) -> int:
-    """Descriptor that holds the folder until it is closed, or its process ends."""
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[int]:
+    """Descriptor that holds the folder until it or its process ends; closed where its context fails."""
     try:
         descriptor = os.open(path / RECORDING, os.O_RDONLY)
     except OSError as error:
         raise ValueError(f"run: {path} cannot be read as a run ({error})") from error
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ValueError(f"run: {path} is being recorded by another process") from None
+        yield descriptor
+    except BaseException:
         os.close(descriptor)
-        raise ValueError(f"run: {path} is being recorded by another process") from None
-    return descriptor
+        raise

@@ -421,9 +421,6 @@ def parse_notes(text: str, where: str) -> Notes:
     ValueError
         If it is no mapping, or a field is unknown or of the wrong kind.
     """
-    try:
-        given = parse_yaml(text) if text.strip() else {}
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+    given = build(parse_yaml, f"{where}:", text) if text.strip() else {}
     require(isinstance(given, dict), where, text, "a YAML mapping")
     return read_dataclass(Notes, given, where)

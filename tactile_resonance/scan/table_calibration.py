@@ -21,6 +21,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Six, Vector
 from tactile_resonance.fields import (
+    build,
     check_above_zero,
     check_within,
     number,
@@ -66,10 +67,7 @@ class CalibrationRequest:
     file: str = ""
 
     def __post_init__(self) -> None:
-        try:
-            SensorUse(name=self.sensor)
-        except ValueError as error:
-            raise ValueError(f"sensor: {error}") from error
+        build(SensorUse, "sensor:", self.sensor)
         check_above_zero(self, "force_n")
         ranges = {"search_m": (0.0, MOST_SEARCH_M), "flatness_m": (0.0, 1e-3)}
         check_within(self, **ranges, most_tilt_rad=(1e-6, 0.2))
@@ -82,10 +80,7 @@ class CalibrationRequest:
         require(len(heights) == 1, "points: z", heights, "one height, that of the touched surface")
         # what even the best touches there would not determine is not touched
         least = math.hypot(LEAST_TOUCH_STD_M, self.flatness_m)
-        try:
-            best = fit_surface(self.points_m, least)
-        except ValueError as error:
-            raise ValueError(f"points: {error}") from error
+        best = build(fit_surface, "points:", self.points_m, least)
         _covariance(best, self.height_m)
 
     @property
