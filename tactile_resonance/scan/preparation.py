@@ -34,7 +34,6 @@ from tactile_resonance.scan.surface_search import find_surface, fit_surface
 UNCHECKED = Skipped(
     "the check that the housing is clear of the surface",
     "how the sensor is used is not known: it is kept clear of a plane only",
-    0.0,
 )
 
 

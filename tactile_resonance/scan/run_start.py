@@ -105,21 +105,18 @@ def start_run(
     use = None if tip_use is None else lambda: tip_use(scene.sensor.name)
     plan, found = prepare(wanted, radius_m, find, use)
     seed = goal.seed or seed
-    facts = run_facts(
-        plan,
-        seed,
-        {
-            "name": scene.name,
-            "notes": scene.notes.as_json(),
-            "scan_node": {
-                "contact": "robot" if hands.free_air else "none",
-                "table_in_base": frames.table_in_base.vector.tolist(),
-                "base_frame": frames.base,
-            },
-            "frames": {name: pose.vector.tolist() for name, pose in frames.others.items()},
-            **found,
+    facts = {
+        **run_facts(plan, seed),
+        "name": scene.name,
+        "notes": scene.notes.as_json(),
+        "scan_node": {
+            "contact": "robot" if hands.free_air else "none",
+            "table_in_base": frames.table_in_base.vector.tolist(),
+            "base_frame": frames.base,
         },
-    )
+        "frames": {name: pose.vector.tolist() for name, pose in frames.others.items()},
+        **found,
+    }
     places = plan.points if scene.adaptive else ()
     run = RunDirectory.create(path, text, plan.first_points, facts, needed, places)
     return plan, run, seed
@@ -179,17 +176,8 @@ def _frames_of(facts: Mapping[str, Any], scene: ScanScene, frames: Frames) -> di
     return {name: Pose.from_vector(vector) for name, vector in noted.items()}
 
 
-def run_facts(plan: Plan, seed: int, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Facts of a run that begins now, as JSON holds them.
-
-    Parameters
-    ----------
-    plan : Plan
-    seed : int
-        Of the excitations.
-    more : mapping, optional
-        What else belongs to the run: parameters of the nodes, frames, a surface that was found.
-    """
+def run_facts(plan: Plan, seed: int) -> dict[str, Any]:
+    """Facts of a run that begins now with excitations of a seed, as JSON holds them."""
     design = plan.measurement
     return {
         "begun": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -208,7 +196,6 @@ def run_facts(plan: Plan, seed: int, more: Mapping[str, Any] | None = None) -> d
             "most_periods": design.periods,
         },
         "skipped": [asdict(skipped) for skipped in plan.skipped],
-        **(more or {}),
     }
 
 
