@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache
+from multiprocessing import active_children
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TypeVar
@@ -293,13 +294,20 @@ class _Processes:
 
     def __init__(self) -> None:
         self._count = len(os.sched_getaffinity(0))
+        self._before = set(active_children())
         self._pool = ProcessPoolExecutor(self._count, initializer=_begin_process)
 
     def __enter__(self) -> _Processes:
         return self
 
     def __exit__(self, kind: Any, *_: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        if kind is None:
+            self._pool.shutdown()
+            return
+        # an interrupt may have left a lock of the pool taken, for which a shutdown would wait for ever
+        for process in set(active_children()) - self._before:
+            process.kill()
+            process.join()
 
     def in_order(self, function: Callable[[Task], Found], jobs: Iterable[Task]) -> Iterator[Found]:
         """What a function gives for each of some jobs, few of which are under way at a time."""
