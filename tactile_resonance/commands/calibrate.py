@@ -190,13 +190,12 @@ def _check(calibration: Calibration, records: Sequence[CalibrationRecord]) -> in
 
 
 def as_text(fitted: Fitted, truth: np.ndarray | None = None) -> str:
-    """Table of the parameters; with the truth, errors over deviations."""
+    """Table of the parameters; with the truth, errors over deviations, where it has as many modes."""
     made = fitted.calibration
+    if truth is not None and truth.size != made.model.values.size:
+        truth = None
     lines = [f"{'parameter':22s}{'value':>14s}{'std':>11s}"]
     lines[0] += "" if truth is None else f"{'truth':>14s}{'error / std':>13s}"
-    size = made.model.values.size
-    if truth is not None and truth.size != size:
-        truth = None
     for k, (name, value, std) in enumerate(
         zip(made.model.names, made.model.values, made.std, strict=True)
     ):
