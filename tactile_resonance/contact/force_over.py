@@ -10,9 +10,8 @@ relative to the first of them: no cumulative sum of earlier forces is there to c
 from __future__ import annotations
 
 import math
-import struct
 import threading
-from bisect import bisect_left, bisect_right
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,9 +34,6 @@ LEAST_COVERAGE = 0.8
 
 BATCHES, LEAST_WRENCHES = 8, 32
 """For the standard deviation of the mean."""
-
-PERIODS = 20
-"""What so many periods of the loop brought is stored at once: that takes a third of the time."""
 
 SPARE = 1.1
 """A source may be faster than it states by this factor without losing the oldest wrenches."""
@@ -93,12 +89,14 @@ class ForceRecord:
         for name, value in (("rate_hz", rate_hz), ("period_s", period_s), ("length_s", length_s)):
             require(0 < value < math.inf, name, value, "a number above 0")
         self._length_ns = round(1e9 * length_s)
-        self._forces = _Ring(1, math.ceil(SPARE * rate_hz * length_s) + 1)
+        # rows of a time [ns] and a force, or the six numbers of a pose: tuples of plain numbers, which Python's
+        # collection of garbage does not look at
+        self._forces, self._poses = (
+            deque[tuple[float, ...]](maxlen=math.ceil(SPARE * most) + 1)
+            for most in (rate_hz * length_s, length_s / period_s)
+        )
         self._force_gap_ns = GAP_PERIODS * 1e9 / rate_hz
-        self._poses = _Ring(6, math.ceil(SPARE * length_s / period_s) + 1)
         self._now_ns, self._zero_std_n = 0, 0.0
-        # of the last periods: wrenches, zero that counts for them (None: they are no forces), state of the arm
-        self._new: list[tuple[Sequence[WrenchSample], float | None, ArmSample | None]] = []
         self._lock = threading.Lock()
 
     def restart(self, zero_std_n: float = 0.0) -> None:
@@ -110,7 +108,6 @@ class ForceRecord:
             Standard deviation of the new zero along the normal [N].
         """
         with self._lock:
-            self._store()
             self._forces.clear()
             self._zero_std_n = zero_std_n
 
@@ -138,11 +135,18 @@ class ForceRecord:
             Whether these wrenches are forces of a contact: after a tare and without a fault. Others
             count as not heard.
         """
+        zero_n, forces, poses = bias_n[2], self._forces, self._poses
         with self._lock:
             self._now_ns = time_ns
-            self._new.append((wrenches, bias_n[2] if valid else None, arm))
-            if len(self._new) >= PERIODS:
-                self._store()
+            # what is told again is left out
+            newest_ns = forces[-1][0] if forces else -math.inf
+            for heard_ns, force_n, _, overload in wrenches:
+                if heard_ns > newest_ns:
+                    newest_ns = heard_ns
+                    good = valid and not overload
+                    forces.append((heard_ns, force_n[2] - zero_n if good else math.nan))
+            if arm is not None and (not poses or arm.time_ns > poses[-1][0]):
+                poses.append((arm.time_ns, *arm.position_m, *arm.rotation_rad))
 
     def over(self, t0_ns: int, t1_ns: int) -> ForceOver:
         """Return what is known of the interval from `t0_ns` to `t1_ns`.
@@ -154,11 +158,11 @@ class ForceRecord:
         """
         require(t0_ns < t1_ns, "t1_ns", t1_ns, f"above t0_ns = {t0_ns}")
         with self._lock:
-            self._store()
-            now_ns, oldest_ns = self._now_ns, self._forces.kept_since_ns
-            zero_std_n = self._zero_std_n
-            times, rows = self._forces.around(t0_ns, t1_ns)
-            pose_times, poses = self._poses.around(t0_ns, t1_ns)
+            now_ns, zero_std_n = self._now_ns, self._zero_std_n
+            full = len(self._forces) == self._forces.maxlen
+            oldest_ns = self._forces[0][0] if full else -math.inf
+            times, rows = _around(self._forces, t0_ns, t1_ns, 1)
+            pose_times, poses = _around(self._poses, t0_ns, t1_ns, 6)
         spans = _Spans(times, rows, t0_ns, t1_ns, self._force_gap_ns)
         places = _Spans(pose_times, poses[:, :3], t0_ns, t1_ns, POSE_GAP_NS)
         position_m = rotation_rad = (math.nan, math.nan, math.nan)
@@ -180,23 +184,13 @@ class ForceRecord:
         force_n = float(spans.mean()[0])
         return ForceOver(force_n, std_n, spread, spans.coverage, position_m, rotation_rad, "")
 
-    def _store(self) -> None:
-        """Put what has come into the rings."""
-        forces, poses = self._forces.append, self._poses.append
-        for wrenches, zero_n, arm in self._new:
-            for time_ns, force_n, _, overload in wrenches:
-                forces(time_ns, math.nan if zero_n is None or overload else force_n[2] - zero_n)
-            if arm is not None:
-                poses(arm.time_ns, *arm.position_m, *arm.rotation_rad)
-        self._new.clear()
-
     def _missing(
-        self, t0_ns: int, t1_ns: int, now_ns: int, oldest_ns: int | None, coverage: float
+        self, t0_ns: int, t1_ns: int, now_ns: int, oldest_ns: float, coverage: float
     ) -> str:
         """Why the force of an interval is not known; empty where it is."""
         if t1_ns > now_ns:
             return f"the block ends {(t1_ns - now_ns) * 1e-6:.1f} ms in the future"
-        if t0_ns < now_ns - self._length_ns or (oldest_ns is not None and t0_ns < oldest_ns):
+        if t0_ns < max(now_ns - self._length_ns, oldest_ns):
             ago_s, length_s = (now_ns - t0_ns) * 1e-9, self._length_ns * 1e-9
             return f"the block begins {ago_s:.1f} s ago, forces are kept for {length_s:g} s"
         if coverage < LEAST_COVERAGE:
@@ -262,53 +256,17 @@ class _Spans:
         return float(means.std(ddof=1) / math.sqrt(BATCHES))
 
 
-class _Ring:
-    """The newest rows of a time [ns] and some floats, in one block of memory.
-
-    Attributes
-    ----------
-    newest_ns : int
-        Time of the newest row; 0 before the first.
-    """
-
-    def __init__(self, width: int, capacity: int) -> None:
-        self._row = struct.Struct(f"=q{width}d")
-        self._memory = bytearray(self._row.size * capacity)
-        self._words = np.frombuffer(self._memory).reshape(capacity, 1 + width)
-        self._times = self._words.view(np.int64)[:, 0]
-        self._capacity, self._count = capacity, 0
-        self.newest_ns = 0
-
-    def clear(self) -> None:
-        """Forget all rows."""
-        self._count = self.newest_ns = 0
-
-    def append(self, time_ns: int, *values: float) -> None:
-        """Take a row; one that is not newer than the newest is left out."""
-        if time_ns <= self.newest_ns and self._count:
-            return
-        at = self._count % self._capacity * self._row.size
-        self._row.pack_into(self._memory, at, time_ns, *values)
-        self.newest_ns = time_ns
-        self._count += 1
-
-    @property
-    def kept_since_ns(self) -> int | None:
-        """Time of the oldest row; None where none has been lost."""
-        if self._count <= self._capacity:
-            return None
-        return int(self._times[self._count % self._capacity])
-
-    def around(self, t0_ns: int, t1_ns: int) -> tuple[IntArray, FloatArray]:
-        """Times (n,) and values (n, width) of an interval, and one row more on either side."""
-        kept = range(max(0, self._count - self._capacity), self._count)
-        first = max(0, bisect_right(kept, t0_ns, key=self._time_of) - 1)
-        asked = kept[first : bisect_left(kept, t1_ns, key=self._time_of) + 1]
-        begin = asked.start % self._capacity
-        rows = self._words[begin : begin + len(asked)].copy()
-        if len(rows) < len(asked):
-            rows = np.concatenate([rows, self._words[: len(asked) - len(rows)]])
-        return rows.view(np.int64)[:, 0], rows[:, 1:]
-
-    def _time_of(self, number: int) -> int:
-        return int(self._times[number % self._capacity])
+def _around(
+    rows: deque[tuple[float, ...]], t0_ns: int, t1_ns: int, width: int
+) -> tuple[IntArray, FloatArray]:
+    """Times (n,) and values (n, width) of an interval, and one row more on either side."""
+    kept: list[tuple[float, ...]] = []
+    for row in reversed(rows):  # what is asked for has just been
+        if row[0] >= t1_ns:
+            kept.clear()
+        kept.append(row)
+        if row[0] <= t0_ns:
+            break
+    kept.reverse()
+    values = np.array([row[1:] for row in kept], float).reshape(len(kept), width)
+    return np.array([row[0] for row in kept], np.int64), values

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from tactile_resonance.contact import force_over
 from tactile_resonance.contact.force_over import ForceRecord
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 
@@ -324,27 +325,28 @@ def test_arm_that_is_seen_in_every_other_period_is_seen():
     assert over.position_m[0] == pytest.approx(0.201, rel=1e-12)
 
 
-def test_nothing_is_added_while_another_thread_asks():
+def test_nothing_is_added_while_another_thread_asks(monkeypatch):
     times = BEGAN_NS + MS * np.arange(400)
     record = filled(times, np.full(400, 0.01))
     sample = WrenchSample(int(times[-1]) + MS, (0.0, 0.0, 5.0), ZERO)
     adding = threading.Thread(
         target=record.add, args=(sample.time_ns, [sample], ZERO, None), kwargs={"valid": True}
     )
-    around = record._forces.around
+    around = force_over._around
 
-    def asked(t0_ns, t1_ns):
-        adding.start()
-        adding.join(0.2)
-        assert adding.is_alive()
-        return around(t0_ns, t1_ns)
+    def asked(rows, *interval):
+        if rows is record._forces:
+            adding.start()
+            adding.join(0.2)
+            assert adding.is_alive()
+        return around(rows, *interval)
 
-    record._forces.around = asked
+    monkeypatch.setattr(force_over, "_around", asked)
     assert record.over(BEGAN_NS + 100 * MS, int(times[-1])).force_n == pytest.approx(
         0.01, rel=1e-12
     )
     adding.join()
-    record._forces.around = around
+    monkeypatch.undo()
     # what was being added meanwhile is there now
     over = record.over(int(times[-1]), sample.time_ns)
     assert over.force_n == pytest.approx((0.01 + 5.0) / 2, rel=1e-12)
