@@ -17,6 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
+from tactile_resonance.contact.envelope import inside
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -65,13 +66,15 @@ class TipPath:
     ----------
     goal, tip
         As given.
+    touch_m : tuple of 3 floats
+        Place of the tip where the ball touches the surface as it is expected, in the base [m].
     normal : tuple of 3 floats
         Out of the tissue, in the base.
     """
 
     def __init__(self, goal: ContactGoal, tip: TipGeometry | None = None) -> None:
         self.goal, self.tip = goal, tip
-        self._touch_m = vector(goal.touch.position_m)
+        self.touch_m = vector(goal.touch.position_m)
         self._seen_rad = vector(goal.touch.rotation_rad)
         self._goal = turn_from_vector(self._seen_rad)
         self.normal: Vector = self._goal[2], self._goal[5], self._goal[8]
@@ -82,11 +85,11 @@ class TipPath:
 
     def height_m(self, arm: ArmSample) -> float:
         """Of the tip above the expected first touch, along the normal."""
-        return dot(self.normal, difference(arm.position_m, self._touch_m))
+        return dot(self.normal, difference(arm.position_m, self.touch_m))
 
     def place_at(self, height_m: float) -> Vector:
         """Place of the tip straight above the touch."""
-        x, y, z = self._touch_m
+        x, y, z = self.touch_m
         nx, ny, nz = self.normal
         return x + height_m * nx, y + height_m * ny, z + height_m * nz
 
@@ -153,7 +156,7 @@ class TipPath:
 
     def along_normal(self, arm: ArmSample, speed_m_s: float) -> Six:
         """Along the normal, away from the surface positive; keeps place along it and orientation."""
-        away = difference(self._touch_m, arm.position_m)
+        away = difference(self.touch_m, arm.position_m)
         speed = speed_m_s - dot(self.normal, away) / RIGHTING_S
         x, y, z = away
         nx, ny, nz = self.normal
@@ -180,24 +183,6 @@ MARGIN_M = 2e-3
 
 PASSED_M, PASSED_RAD = 5e-4, 1e-2
 """Nearer than this to a place or an orientation on the way, the tip goes on to the next."""
-
-
-@dataclass(frozen=True)
-class _Plane:
-    """A surface as the way takes it.
-
-    Attributes
-    ----------
-    touch_m : Vector
-        Place of the tip where the ball touches it as it is expected.
-    normal : Vector
-    up_m : float
-        So far above its place it may be.
-    """
-
-    touch_m: Vector
-    normal: Vector
-    up_m: float
 
 
 @dataclass(frozen=True)
@@ -277,10 +262,7 @@ class TurningWay:
             vector_from_turn(turn_product(goal.touch.turn, transposed(swing.last))),
         )
         # the tip may have been left pressing, as deep as it may
-        planes = (
-            _Plane(start.position_m, old, limits.depth_m),
-            _Plane(vector(goal.touch.position_m), new, parameters.early_m),
-        )
+        planes = ((self.departure, limits.depth_m), (path, parameters.early_m))
         up = added(old, new)
         half = math.hypot(*up) / 2  # cosine of half the angle between both normals
         up = scaled(1 / max(2 * half, 1e-9), up)
@@ -328,12 +310,18 @@ class TurningWay:
         return None
 
     def _lacking(
-        self, place_m: Vector, planes: tuple[_Plane, ...], sweeps: tuple[_Sweep, ...]
+        self,
+        place_m: Vector,
+        planes: tuple[tuple[TipPath, float], ...],
+        sweeps: tuple[_Sweep, ...],
     ) -> float:
-        """How much higher than at a place the tip must be for all sweeps to be clear of all planes [m]."""
+        """How much higher than at a place the tip must be for all sweeps to be clear of all planes [m].
+
+        A plane is that of a path, and how far above its place it may be.
+        """
         limits, lacking = self._limits, 0.0
-        for plane in planes:
-            height = dot(plane.normal, difference(place_m, plane.touch_m)) - plane.up_m - MARGIN_M
+        for plane, up_m in planes:
+            height = dot(plane.normal, difference(place_m, plane.touch_m)) - up_m - MARGIN_M
             lacking = max(lacking, limits.near_m - height)
             if self._tip is not None:
                 edge = min(sweep.lowest(plane.normal, self._tip.housing_m) for sweep in sweeps)
@@ -342,9 +330,7 @@ class TurningWay:
 
     def _require_inside(self, place: Vector, off_rad: float, rise_m: float, down_m: float) -> None:
         box = self._limits.workspace
-        if any(
-            x < low or x > high for x, low, high in zip(place, box.low_m, box.high_m, strict=True)
-        ):
+        if not inside(place, box.low_m, box.high_m):
             x, y, z = place
             raise ValueError(
                 f"touch: to turn by {off_rad:.2f} rad clear of the surface and of that which it leaves, "
