@@ -8,7 +8,6 @@ import math
 from tactile_resonance.contact.envelope import Place
 from tactile_resonance.contact.goal import REST, Move, State, failed
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tare import Zero
@@ -29,8 +28,6 @@ class FreeMotion:
     ----------
     path : TipPath
     observer : Observer
-    parameters : ContactParameters
-    limits : Limits
     touch_speed_m_s : float
         At which the tissue may be met, at most.
     under_sample : bool
@@ -52,18 +49,16 @@ class FreeMotion:
         self,
         path: TipPath,
         observer: Observer,
-        parameters: ContactParameters,
-        limits: Limits,
-        touch_speed_m_s: float = math.inf,
+        touch_speed_m_s: float,
         *,
-        under_sample: bool = False,
-        zero: Zero | None = None,
+        under_sample: bool,
+        zero: Zero | None,
     ) -> None:
         self._under_sample, self._zero = under_sample, zero
         self._path, self._observer, self._touch_speed_m_s = path, observer, touch_speed_m_s
-        self._parameters, self._limits = parameters, limits
+        self._parameters, self._limits = observer.parameters, observer.limits
         self.begun = False
-        self.rest_m = parameters.standoff_m
+        self.rest_m = observer.parameters.standoff_m
         self._turning: TurningWay | None = None
         self._travel_force_n: Vector | None = None
         self._still_ns = -1

@@ -10,7 +10,7 @@ from tactile_resonance.contact.free_motion import FreeMotion
 from tactile_resonance.contact.goal import ENDED, TARED, TOUCHING, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import ContactParameters, Workspace
+from tactile_resonance.contact.parameters import Workspace
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import Vector
@@ -27,25 +27,19 @@ class Judgement:
     envelope : Envelope
     observer : Observer
         Takes the forces.
-    parameters : ContactParameters
-    start_ns : int
-        When the contact was asked for.
     free : FreeMotion
         Knows the way of the goal.
+    start_ns : int
+        When the contact was asked for.
     """
 
     def __init__(
-        self,
-        envelope: Envelope,
-        observer: Observer,
-        parameters: ContactParameters,
-        start_ns: int,
-        free: FreeMotion,
+        self, envelope: Envelope, observer: Observer, free: FreeMotion, start_ns: int
     ) -> None:
         self._envelope, self._observer, self._start_ns = envelope, observer, start_ns
         self._free = free
         self._way: Workspace | None = None  # known with the first state of the arm
-        limits = envelope.limits
+        limits, parameters = envelope.limits, observer.parameters
         self._lowest_m = -parameters.search_m - limits.depth_m
         self._longest_s = {
             State.TRAVEL: limits.travel_s,

@@ -207,16 +207,14 @@ class ContactController:
         path = TipPath(goal, self._tip)
         speed = math.inf if self._is_known(goal) else p.first_speed_m_s(limits.abort_force_n)
         zero = self._zero_for(goal)
-        free = FreeMotion(
-            path, observer, p, limits, speed, under_sample=self._under_sample, zero=zero
-        )
+        free = FreeMotion(path, observer, speed, under_sample=self._under_sample, zero=zero)
         if arm is not None and is_finite(arm):
             free.begin(arm)
         self.goal, self._observer, self._free = goal, observer, free
         self._outcome = Outcome(observer, now_ns)
-        self._pressing = Pressing(goal, path, observer, p, limits, speed)
-        self._withdrawal = Withdrawal(free, observer, p, limits)
-        self._judgement = Judgement(self._envelope, observer, p, now_ns, free)
+        self._pressing = Pressing(path, observer, speed)
+        self._withdrawal = Withdrawal(free, observer)
+        self._judgement = Judgement(self._envelope, observer, free, now_ns)
         self._stays = self._pressed_too_hard = self._rising = False
         self._pressed_n, self._zero, self._usual_m = 0.0, None, self.parameters.standoff_m
         self._enter(State.TRAVEL, now_ns)

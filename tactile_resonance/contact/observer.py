@@ -73,6 +73,8 @@ class Observer:
 
     Attributes
     ----------
+    parameters, limits : ContactParameters, Limits
+        Of this contact.
     watch : ForceWatch
     arm_model : ArmModel
     model : ContactFilter or None
@@ -90,7 +92,8 @@ class Observer:
     """
 
     def __init__(self, parameters: ContactParameters, limits: Limits) -> None:
-        p = self._parameters = parameters
+        p = self.parameters = parameters
+        self.limits = limits
         self.watch = ForceWatch(limits.stuck_samples, limits.lost_s)
         self.arm_model = ArmModel(
             dead_time_s=p.arm_dead_time_s, lag_s=p.arm_lag_s, period_s=p.period_s
@@ -129,7 +132,7 @@ class Observer:
             agree with it, or leaves it too uncertain, is wrong too.
         """
         self.taring = False
-        p = self._parameters
+        p = self.parameters
         try:
             look = tare(self._unloaded, p)
         except TareError as error:
@@ -215,8 +218,8 @@ class Observer:
             heights,
             forces,
             noise_n=self.noise_n,
-            beam_n_per_m=self._parameters.beam_n_per_m,
-            vibration_m=self._parameters.arm_vibration_m,
+            beam_n_per_m=self.parameters.beam_n_per_m,
+            vibration_m=self.parameters.arm_vibration_m,
             inflation=self._inflation,
         )
         if self.touched_m is None:

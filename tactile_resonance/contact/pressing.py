@@ -15,10 +15,10 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.contact_filter import ContactFilter
 from tactile_resonance.contact.envelope import Place
-from tactile_resonance.contact.goal import ContactGoal, Move, State, failed
+from tactile_resonance.contact.goal import Move, State, failed
 from tactile_resonance.contact.law import SURE_SHARE, HoldMode, force_speed, place_speed
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, Limits
+from tactile_resonance.contact.parameters import REACTION_S
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import TipPath
@@ -118,11 +118,8 @@ class Pressing:
 
     Parameters
     ----------
-    goal : ContactGoal
     path : TipPath
     observer : Observer
-    parameters : ContactParameters
-    limits : Limits
     touch_speed_m_s : float
         With which the tip goes deeper until the force is reached, at most.
 
@@ -134,18 +131,11 @@ class Pressing:
         Of the tip while it holds.
     """
 
-    def __init__(
-        self,
-        goal: ContactGoal,
-        path: TipPath,
-        observer: Observer,
-        parameters: ContactParameters,
-        limits: Limits,
-        touch_speed_m_s: float = math.inf,
-    ) -> None:
+    def __init__(self, path: TipPath, observer: Observer, touch_speed_m_s: float) -> None:
+        goal, limits = path.goal, observer.limits
         self._touch_speed_m_s = touch_speed_m_s
         self._goal, self._aim, self._path, self._observer = goal, goal.aim, path, observer
-        self._parameters, self._limits = parameters, limits
+        self._parameters, self._limits = observer.parameters, limits
         self.touched_ns = 0
         self.motion = HeldMotion()
         self._lost_n = limits.lost_below_n(goal.aim.force_n)

@@ -17,7 +17,7 @@ from tactile_resonance.contact.envelope import Place
 from tactile_resonance.contact.free_motion import STILL_M_S, FreeMotion
 from tactile_resonance.contact.goal import Move, State, failed
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import REACTION_S, ContactParameters, Limits
+from tactile_resonance.contact.parameters import REACTION_S
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import ARRIVED_M
@@ -58,8 +58,6 @@ class Withdrawal:
     free : FreeMotion
         Knows which surface is left.
     observer : Observer
-    parameters : ContactParameters
-    limits : Limits
 
     Attributes
     ----------
@@ -68,11 +66,9 @@ class Withdrawal:
         believed, or no zero was taken.
     """
 
-    def __init__(
-        self, free: FreeMotion, observer: Observer, parameters: ContactParameters, limits: Limits
-    ) -> None:
+    def __init__(self, free: FreeMotion, observer: Observer) -> None:
         self._free, self._observer = free, observer
-        self._parameters, self._limits = parameters, limits
+        self._parameters, self._limits = observer.parameters, observer.limits
         self.zero_n: float | None = None
         self._least_n: float | None = None  # force along the normal that is accepted
         self._surface_m = -math.inf  # where the tissue was touched
