@@ -26,9 +26,10 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.drivers.can_frames import read_can_description
 from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.drivers.nidaq_config import read_nidaq_config
-from tactile_resonance.drivers.twist import read_twist_config
+from tactile_resonance.drivers.nidaq_config import NiDaqConfig
+from tactile_resonance.drivers.twist import TwistConfig
 from tactile_resonance.drivers.ur_config import read_ur_config
+from tactile_resonance.fields import read_file
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.record import Channel, Record
 from tactile_resonance.recording.recording import read_recording
@@ -58,8 +59,8 @@ covariance: [[1.0e-8, 0.0, 0.0], [0.0, 1.0e-8, 0.0], [0.0, 0.0, 1.0e-8]]
 """
 CONFIGURATION: dict[str, Callable[[Path], object]] = {
     "contact.yaml": read_contact,
-    "devices/nidaqmx.yaml": read_nidaq_config,
-    "devices/twist.yaml": read_twist_config,
+    "devices/nidaqmx.yaml": partial(read_file, NiDaqConfig),
+    "devices/twist.yaml": partial(read_file, TwistConfig),
     "devices/ur5e.yaml": read_ur_config,
     "force/*.yaml": read_force_config,
     "force/frames/*.yaml": read_can_description,

@@ -19,13 +19,6 @@ from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, Wrenc
 from tactile_resonance.contact.vectors import Six, six
 from tactile_resonance.fields import check_within
 
-COMMAND_RANGES: dict[str, tuple[float, float]] = {
-    "max_speed_m_s": (1e-4, 1.5),
-    "max_turn_rad_s": (1e-4, math.pi),
-    "max_acceleration_m_s2": (1e-3, 20.0),
-}
-"""Accepted range of each number of `CommandLimits`, ends included."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class CommandLimits:
@@ -44,7 +37,12 @@ class CommandLimits:
     max_acceleration_m_s2: float = 2.0
 
     def __post_init__(self) -> None:
-        check_within(self, **COMMAND_RANGES)
+        check_within(
+            self,
+            max_speed_m_s=(1e-4, 1.5),
+            max_turn_rad_s=(1e-4, math.pi),
+            max_acceleration_m_s2=(1e-3, 20.0),
+        )
 
 
 def checked_twist(twist: Sequence[float], limits: CommandLimits) -> Six:

@@ -6,7 +6,6 @@ While the tip holds a force on tissue that moves, its own way says how far and h
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 

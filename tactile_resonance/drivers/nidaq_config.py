@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 from tactile_resonance.fields import (
@@ -14,7 +13,6 @@ from tactile_resonance.fields import (
     number,
     read,
     read_dataclass,
-    read_file,
     require,
 )
 from tactile_resonance.record import BetweenSamples, InputKind
@@ -118,14 +116,3 @@ class NiDaqConfig:
     def clock(self) -> str:
         """Device whose sample clock and start trigger all use."""
         return self.clock_device or self.sensor.channel.split("/")[0]
-
-
-def read_nidaq_config(path: Path) -> NiDaqConfig:
-    """Read and check a configuration.
-
-    Raises
-    ------
-    ValueError
-        Names the field, its value, and what is accepted.
-    """
-    return read_file(NiDaqConfig, path)

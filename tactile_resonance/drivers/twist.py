@@ -11,7 +11,6 @@ import re
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -29,19 +28,10 @@ from tactile_resonance.contact.vectors import (
     turn_product,
     vector_from_turn,
 )
-from tactile_resonance.fields import check_within, read_file, require
+from tactile_resonance.fields import check_within, require
 
 TOPIC = r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*"
 """As in ROS 2, without substitutions (https://design.ros2.org/articles/topic_and_service_names.html)."""
-
-RANGES: dict[str, tuple[float, float]] = {
-    "rate_hz": (25.0, 1000.0),
-    "max_state_age_s": (0.002, 0.2),
-    "max_command_gap_s": (0.004, 0.5),
-    "follow_s": (0.005, 0.5),
-    "follow_m": (1e-4, 0.01),
-}
-"""Accepted range of each number of its own of `TwistConfig`, ends included."""
 
 
 @dataclass(frozen=True)
@@ -88,24 +78,20 @@ class TwistConfig(CommandLimits):
             require(good, name, value, "the name of a topic: letters, digits, _ and single /")
         accepted = "another topic than command_topic"
         require(self.pose_topic != self.command_topic, "pose_topic", self.pose_topic, accepted)
-        check_within(self, **RANGES)
+        check_within(
+            self,
+            rate_hz=(25.0, 1000.0),
+            max_state_age_s=(0.002, 0.2),
+            max_command_gap_s=(0.004, 0.5),
+            follow_s=(0.005, 0.5),
+            follow_m=(1e-4, 0.01),
+        )
         least = 1 / self.rate_hz
         for name in ("max_state_age_s", "max_command_gap_s", "follow_s"):
             value = getattr(self, name)
             require(value > least, name, value, f"above 1/rate_hz = {least:g}")
         offset = self.tip_in_tool.vector
         require(bool(np.all(abs(offset) < 10)), "tip_in_tool", offset.tolist(), "within +-10")
-
-
-def read_twist_config(path: Path) -> TwistConfig:
-    """Read a YAML file.
-
-    Raises
-    ------
-    ValueError
-        Names the field that is unknown, missing or not accepted, its value and what is.
-    """
-    return read_file(TwistConfig, path)
 
 
 REST: Six = (*ZERO, *ZERO)

@@ -40,6 +40,7 @@ from tactile_resonance.drivers.ur_exchange import (
     UrCommand,
 )
 from tactile_resonance.drivers.ur_session import Session
+from tactile_resonance.fields import read_dataclass
 
 LONGEST_MESSAGE = 8192
 # No command is given to a robot of which the owner has seen nothing for so long.
@@ -162,7 +163,7 @@ class Client:
         self._commands.send(json.dumps(answer).encode())
 
     def _connect(self, request: dict) -> None:
-        config = UrArmConfig.from_dict(request["config"])
+        config = read_dataclass(UrArmConfig, request["config"], "")
         if request["time"]:
             self._clock = SimulatedClock(request["time"], request["time_name"])
             self._clock.free(Demand.REAL)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,15 +10,7 @@ from typing import Any, Literal
 
 from tactile_resonance.contact.interfaces import CommandLimits
 from tactile_resonance.contact.samples import Pose, PoseOfSix
-from tactile_resonance.fields import check_within, read_dataclass, read_file, require
-
-
-def _is_loopback(host: str) -> bool:
-    """Whether an address can be none but this machine's; a name may be anybody's."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+from tactile_resonance.fields import check_within, read_file, require
 
 
 @dataclass(frozen=True)
@@ -91,25 +82,14 @@ class UrArmConfig(CommandLimits):
     @property
     def simulated(self) -> bool:
         """Whether the robot is at an address (127.x.y.z) where no real one is."""
-        return _is_loopback(self.host)
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:  # a name may be anybody's
+            return False
 
     def to_dict(self) -> dict[str, Any]:
-        """Fields as plain numbers and lists."""
-        fields = {name.name: getattr(self, name.name) for name in dataclasses.fields(self)}
-        fields["tip_in_flange"] = self.tip_in_flange.vector.tolist()
-        fields["payload_cog_m"] = list(self.payload_cog_m)
-        return fields
-
-    @classmethod
-    def from_dict(cls, fields: dict[str, Any]) -> UrArmConfig:
-        """Build from plain values.
-
-        Raises
-        ------
-        ValueError
-            Names the field that is unknown, missing or not acceptable.
-        """
-        return read_dataclass(cls, fields, "")
+        """Fields as plain values, which `read_dataclass` takes back."""
+        return vars(self) | {"tip_in_flange": self.tip_in_flange.vector.tolist()}
 
 
 def read_ur_config(path: Path) -> UrArmConfig:

@@ -12,10 +12,10 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.drivers.force_config import CanForce, read_force_config
 from tactile_resonance.drivers.force_sources import force_source
-from tactile_resonance.drivers.twist import TwistConfig, read_twist_config
+from tactile_resonance.drivers.twist import TwistConfig
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
-from tactile_resonance.fields import read_yaml, require
+from tactile_resonance.fields import read_file, read_yaml, require
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Parameter, file_of, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
@@ -129,7 +129,7 @@ def make_arm(node: ManagedNode, priority: int) -> NodeArm:
         ("time_server", node.time_server, "empty"),
     ):
         require(not value, field, value, f"{accepted} for an arm of kind twist")
-    return TwistArm(node, read_twist_config(path), base_frame)
+    return TwistArm(node, read_file(TwistConfig, path), base_frame)
 
 
 def _ur_arm(node: ManagedNode, config: UrArmConfig, stalls_s: float, priority: int) -> UrArm:

@@ -22,7 +22,8 @@ from tactile_resonance.drivers.acquisition import (
     DeviceInfo,
 )
 from tactile_resonance.drivers.nidaq import NiDaqDevice
-from tactile_resonance.drivers.nidaq_config import read_nidaq_config
+from tactile_resonance.drivers.nidaq_config import NiDaqConfig
+from tactile_resonance.fields import read_file
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.goals import answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
@@ -98,7 +99,7 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
         from tactile_resonance.drivers.replay import ReplayDevice
 
         return ReplayDevice(path, speed, _entries_of(path))
-    return NiDaqDevice(read_nidaq_config(path))
+    return NiDaqDevice(read_file(NiDaqConfig, path))
 
 
 def replayed_results(node: ManagedNode) -> tuple[bytes, ...]:

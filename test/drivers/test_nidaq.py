@@ -11,8 +11,9 @@ import pytest
 from tactile_resonance.configuration import share_path
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.drivers.nidaq import NiDaqDevice
-from tactile_resonance.drivers.nidaq_config import read_nidaq_config
+from tactile_resonance.drivers.nidaq_config import NiDaqConfig
 from tactile_resonance.drivers.nidaq_scale import CountScale
+from tactile_resonance.fields import read_file
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import BetweenSamples, InputKind
 
@@ -20,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import fake_nidaqmx
 
 EXAMPLE = share_path("config/devices/nidaqmx.yaml")
-CONFIG = read_nidaq_config(EXAMPLE)
+CONFIG = read_file(NiDaqConfig, EXAMPLE)
 RATE_HZ = 50e3
 EXCITATION = design_multisine(
     sample_rate_hz=RATE_HZ, samples_per_period=500, band_hz=(100.0, 10e3), periods=4, seed=1

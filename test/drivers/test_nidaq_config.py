@@ -5,7 +5,8 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.drivers.nidaq_config import read_nidaq_config
+from tactile_resonance.drivers.nidaq_config import NiDaqConfig
+from tactile_resonance.fields import read_file
 
 EXAMPLE = share_path("config/devices/nidaqmx.yaml")
 
@@ -38,5 +39,5 @@ def test_wrong_configuration_is_named(tmp_path, change, message):
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(ValueError, match=message) as raised:
-        read_nidaq_config(path)
+        read_file(NiDaqConfig, path)
     assert str(raised.value).startswith("mine.yaml: ")

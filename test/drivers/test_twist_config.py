@@ -8,9 +8,19 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.interfaces import COMMAND_RANGES
-from tactile_resonance.drivers.twist import RANGES, read_twist_config
+from tactile_resonance.drivers.twist import TwistConfig
+from tactile_resonance.fields import read_file
 
+RANGES = {
+    "rate_hz": (25.0, 1000.0),
+    "max_state_age_s": (0.002, 0.2),
+    "max_command_gap_s": (0.004, 0.5),
+    "follow_s": (0.005, 0.5),
+    "follow_m": (1e-4, 0.01),
+    "max_speed_m_s": (1e-4, 1.5),
+    "max_turn_rad_s": (1e-4, np.pi),
+    "max_acceleration_m_s2": (1e-3, 20.0),
+}
 GIVEN = yaml.safe_load(share_path("config/devices/twist.yaml").read_text(encoding="utf-8"))
 
 
@@ -20,13 +30,13 @@ def read(tmp_path):
         path = tmp_path / "mine.yaml"
         fields = {name: value for name, value in (GIVEN | changed).items() if value != "left out"}
         path.write_text(yaml.safe_dump(fields), encoding="utf-8")
-        return read_twist_config(path)
+        return read_file(TwistConfig, path)
 
     return read
 
 
 def test_the_file_of_the_package_states_the_defaults(read):
-    config = read_twist_config(share_path("config/devices/twist.yaml"))
+    config = read_file(TwistConfig, share_path("config/devices/twist.yaml"))
     needed = {"kind", "command_topic", "pose_topic", "tip_in_tool"}
     least = read(**dict.fromkeys(set(GIVEN) - needed, "left out"))
     assert {**vars(config), "tip_in_tool": 0} == {**vars(least), "tip_in_tool": 0}
@@ -39,7 +49,7 @@ def test_the_place_of_the_tip_in_the_tool_is_read(read):
     assert read(tip_in_tool=offset).tip_in_tool.vector.tolist() == offset
 
 
-@pytest.mark.parametrize(("name", "limits"), {**RANGES, **COMMAND_RANGES}.items())
+@pytest.mark.parametrize(("name", "limits"), RANGES.items())
 def test_numbers_out_of_range_are_named(read, name, limits):
     low, high = limits
     for value in (0.99 * low, 1.01 * high):

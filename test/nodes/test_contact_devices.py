@@ -12,9 +12,10 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.drivers.twist import read_twist_config
+from tactile_resonance.drivers.twist import TwistConfig
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
+from tactile_resonance.fields import read_file
 from tactile_resonance.nodes import contact_devices
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.running import initialised
@@ -91,7 +92,7 @@ def test_what_is_only_of_a_universal_robot_is_refused_with_a_twist_controller(gi
 def twist_arm():
     with initialised(domain_id=free_domain_id(os.environ)):
         node = ManagedNode("contact_devices_test", (*contact_devices.PARAMETERS, TIME_SERVER))
-        arm = TwistArm(node, read_twist_config(share_path(TWIST)), "base")
+        arm = TwistArm(node, read_file(TwistConfig, share_path(TWIST)), "base")
         yield arm
         node.destroy_node()
 

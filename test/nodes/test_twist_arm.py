@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.drivers.twist import read_twist_config
+from tactile_resonance.drivers.twist import TwistConfig
+from tactile_resonance.fields import read_file
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, PLACES, initialised
@@ -29,7 +30,7 @@ from tactile_resonance.nodes.twist_arm import TwistArm
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import time_from_message
 
-CONFIG = read_twist_config(share_path("config/devices/twist.yaml"))
+CONFIG = read_file(TwistConfig, share_path("config/devices/twist.yaml"))
 AHEAD_NS = 1_700_000_000 * 10**9  # ROS time less the clock's
 PERIOD_NS = 2_000_000
 DOWN = (0.0, 0.0, -0.01, 0.0, 0.0, 0.0)

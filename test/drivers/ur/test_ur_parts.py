@@ -2,6 +2,7 @@
 """Parts of the arm's driver that need no robot: page, commands, states, motion, configuration, fault names."""
 
 import itertools
+import json
 import tempfile
 from types import SimpleNamespace
 
@@ -24,6 +25,7 @@ from tactile_resonance.drivers.ur_exchange import (
     UrCommand,
 )
 from tactile_resonance.drivers.ur_states import StateReader, motion_fault
+from tactile_resonance.fields import read_dataclass
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 
 
@@ -242,7 +244,8 @@ def test_shipped_configuration_is_that_of_the_simulated_robot():
     config = read_ur_config(share_path("config/devices/ur5e.yaml"))
     assert config.host == "127.0.1.1"
     np.testing.assert_allclose(config.tip_in_flange.vector, TIP_IN_FLANGE.vector)
-    again = UrArmConfig.from_dict(config.to_dict())
+    # to the client process and back
+    again = read_dataclass(UrArmConfig, json.loads(json.dumps(config.to_dict())), "")
     assert again.to_dict() == config.to_dict()
 
 
