@@ -103,7 +103,7 @@ def _connected() -> Iterator[ContactLoop]:
     assert isinstance(config, CanForce)
     bus = {**config.bus, "host": HOST}
     config = replace(config, bus=bus)
-    force = force_source(config, arm.state, arm_clock_std_s=lambda: arm.clock_uncertainty_s)
+    force = force_source(config, arm)
     try:
         arm.connect()
         _lift(arm)

@@ -5,33 +5,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from tactile_resonance.clock import Clock
-from tactile_resonance.contact.interfaces import Cell
-from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.interfaces import Cell, NodeArm
 from tactile_resonance.contact.tip_force import TipForce
 from tactile_resonance.drivers.force_config import CanForce, ForceConfig, TopicForce
 from tactile_resonance.drivers.rtde_wrench import RtdeWrench
 
 
 def force_source(
-    config: ForceConfig,
-    arm_state: Callable[[], ArmSample],
-    *,
-    clock: Clock | None = None,
-    arm_clock_std_s: Callable[[], float] | None = None,
-    topic: Callable[[TopicForce], Cell] | None = None,
+    config: ForceConfig, arm: NodeArm, topic: Callable[[TopicForce], Cell] | None = None
 ) -> TipForce:
     """Make the source; nothing is opened before its `start`.
 
     Parameters
     ----------
     config : ForceConfig
-    arm_state : callable
-        Newest state of the arm, without waiting.
-    clock : Clock or None
-        On which wrenches are dated; this machine's where it is not given.
-    arm_clock_std_s : callable or None
-        How well the arm's times are known [s].
+    arm : NodeArm
+        That carries the tip; wrenches are dated on its clock.
     topic : callable or None
         Makes the cell of a topic; only a node can.
 
@@ -46,13 +35,13 @@ def force_source(
             from tactile_resonance.drivers.can_wrench import CanWrench
         except ImportError as error:
             raise ValueError("kind: can needs python-can: pip install python-can") from error
-        cell = CanWrench(config, clock)
+        cell = CanWrench(config, arm.clock)
     elif isinstance(config, TopicForce):
         if topic is None:
             raise ValueError("kind: topic is for nodes only")
         cell = topic(config)
     elif type(config) is ForceConfig:
-        cell = RtdeWrench(config, arm_state, clock, arm_clock_std_s)
+        cell = RtdeWrench(config, arm)
     else:
         raise TypeError(f"no source of force for {type(config).__name__}")
-    return TipForce(cell, config.mounting, arm_state)
+    return TipForce(cell, config.mounting, arm.recent)

@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
-from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
-from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceFault, ForceInfo
+from tactile_resonance.contact.interfaces import (
+    ArmError,
+    ForceError,
+    ForceFault,
+    ForceInfo,
+    NodeArm,
+)
 from tactile_resonance.contact.samples import ArmSample, CellSample
 from tactile_resonance.contact.vectors import rotated_back, turn_from_vector
 from tactile_resonance.drivers.force_config import ForceConfig
@@ -24,27 +28,16 @@ class RtdeWrench:
     Parameters
     ----------
     config : ForceConfig
-    arm_state : callable
-        Newest state of the arm, without waiting; may raise `ArmError`.
-    clock : Clock or None
-        On which silence is judged; this machine's where it is not given.
-    clock_std_s : callable or None
-        Standard deviation of the states' times on the clock at present [s].
+    arm : NodeArm
+        Silence is judged on its clock.
     """
 
-    def __init__(
-        self,
-        config: ForceConfig,
-        arm_state: Callable[[], ArmSample],
-        clock: Clock | None = None,
-        clock_std_s: Callable[[], float] | None = None,
-    ) -> None:
+    def __init__(self, config: ForceConfig, arm: NodeArm) -> None:
         mounting = config.mounting
         if mounting.frame.vector.any() or mounting.payload is not None:
             raise ValueError("frame, payload: expected zeros and none, the controller knows both")
-        self._config, self._arm_state, self._clock_std_s = config, arm_state, clock_std_s
+        self._config, self._arm, self._clock = config, arm, arm.clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
-        self._clock: Clock = WallClock() if clock is None else clock
         self._robot_time_s = -math.inf
         self._new_s = 0.0
 
@@ -52,7 +45,7 @@ class RtdeWrench:
     def info(self) -> ForceInfo:
         """What the sensor can do; the uncertainty of its clock is NaN while the arm is not connected."""
         try:
-            std_s = 0.0 if self._clock_std_s is None else self._clock_std_s()
+            std_s = self._arm.clock_uncertainty_s
         except ArmError:
             std_s = float("nan")
         return replace(self._config.info, clock_uncertainty_s=std_s)
@@ -88,7 +81,7 @@ class RtdeWrench:
 
     def _state(self) -> ArmSample:
         try:
-            state = self._arm_state()
+            state = self._arm.recent()
         except ArmError as error:
             raise ForceError(ForceFault.LINK_LOST, f"{self._config.info.name}: {error}") from error
         if state.tool_wrench is None:

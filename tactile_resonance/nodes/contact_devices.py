@@ -192,13 +192,7 @@ def make_force_source(node: ManagedNode, arm: NodeArm) -> TipForce:
         )
     # a retraction while the node goes down needs both
     listens = arm.listener.node if isinstance(arm, TwistArm) else node
-    return force_source(
-        config,
-        arm.recent,
-        clock=arm.clock,
-        arm_clock_std_s=lambda: arm.clock_uncertainty_s,
-        topic=lambda asked: TopicWrench(listens, asked, arm.clock),
-    )
+    return force_source(config, arm, lambda asked: TopicWrench(listens, asked, arm.clock))
 
 
 def tip_geometry(node: ManagedNode) -> TipGeometry:

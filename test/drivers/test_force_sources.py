@@ -3,6 +3,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,9 @@ def test_the_tip_feels_what_presses_on_the_cell_under_the_sample():
     normal = state.tip.rotation.apply([0, 0, 1])
     quiet = CellParameters("quiet", 5000.0, 1e5, 1e-3, 5e-5, 5.0, 0.3)
     bench = CellBench(quiet, (*(-0.01 * normal), 0.0, 0.0, 0.0))
-    source = force_source(bench.config(), lambda: state, clock=bench.clock)
+    source = force_source(
+        bench.config(), SimpleNamespace(recent=lambda: state, clock=bench.clock)
+    )
     try:
         source.start()
         samples = bench.go(source, 1000)
@@ -39,4 +42,4 @@ def test_the_tip_feels_what_presses_on_the_cell_under_the_sample():
 
 def test_a_topic_needs_a_node():
     with pytest.raises(ValueError, match="topic is for nodes only"):
-        force_source(read_force_config(Path("topic.yaml")), lambda: None)
+        force_source(read_force_config(Path("topic.yaml")), None)

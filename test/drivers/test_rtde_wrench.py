@@ -31,16 +31,19 @@ class HandClock:
 
 
 class States:
-    """What an arm would hand out; None: it raises."""
+    """An arm that hands out a state; None: it raises."""
+
+    clock_uncertainty_s = 0.0
 
     def __init__(self):
+        self.clock = HandClock()
         self.now = self.at(1.0, [0.0] * 6)
 
     def at(self, time_s, wrench):
         time_ns, wrench = round(time_s * 1e9), None if wrench is None else six(wrench)
         return ArmSample(time_ns, time_s, PLACE_M, TURNED_RAD, STILL, tool_wrench=wrench)
 
-    def __call__(self):
+    def recent(self):
         if self.now is None:
             raise ArmError(ArmFault.STALE, "state is 30 ms old")
         return self.now
@@ -49,7 +52,7 @@ class States:
 def test_the_wrench_is_turned_into_the_frame_of_the_tip():
     # the tip is turned by 90 degrees about x: its y axis is the base's z, its z the base's -y
     states = States()
-    source = RtdeWrench(CONFIG, states, HandClock())
+    source = RtdeWrench(CONFIG, states)
     source.start()
     assert source.read() == []
     states.now = states.at(1.002, [1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
@@ -62,12 +65,14 @@ def test_the_wrench_is_turned_into_the_frame_of_the_tip():
 def test_it_can_be_made_before_the_arm_is_connected():
     connected = []
 
-    def clock_std_s():
-        if not connected:
-            raise ArmError(ArmFault.LINK_LOST, "not connected")
-        return 2e-4
+    class Arm(States):
+        @property
+        def clock_uncertainty_s(self):
+            if not connected:
+                raise ArmError(ArmFault.LINK_LOST, "not connected")
+            return 2e-4
 
-    source = force_source(CONFIG, States(), arm_clock_std_s=clock_std_s)
+    source = force_source(CONFIG, Arm())
     assert np.isnan(source.info.clock_uncertainty_s)
     connected.append(True)
     assert source.info.clock_uncertainty_s == 2e-4
@@ -83,7 +88,7 @@ def test_it_can_be_made_before_the_arm_is_connected():
 )
 def test_faults_are_named_and_end(state, fault):
     states = States()
-    source = RtdeWrench(CONFIG, states, HandClock())
+    source = RtdeWrench(CONFIG, states)
     source.start()
 
     def read_five():
@@ -102,13 +107,12 @@ def test_faults_are_named_and_end(state, fault):
 
 def test_a_robot_clock_that_stands_still_is_silence():
     states = States()
-    clock = HandClock()
     config = replace(CONFIG, limits=replace(CONFIG.limits, silent_s=0.004))
-    source = RtdeWrench(config, states, clock)
+    source = RtdeWrench(config, states)
     source.start()
-    clock.ns += 3_900_000
+    states.clock.ns += 3_900_000
     assert source.read() == []
-    clock.ns += 200_000
+    states.clock.ns += 200_000
     with pytest.raises(ForceError, match="no new state") as caught:
         source.read()
     assert caught.value.fault is ForceFault.SILENT
@@ -118,7 +122,7 @@ def test_an_arm_without_a_sensor_is_refused():
     states = States()
     states.now = states.at(1.0, None)
     with pytest.raises(ForceError, match="no wrench"):
-        RtdeWrench(CONFIG, states, HandClock()).start()
+        RtdeWrench(CONFIG, states).start()
 
 
 def test_1_cn_is_refused_with_the_figures():

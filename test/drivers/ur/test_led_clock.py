@@ -113,7 +113,7 @@ def test_silence_of_the_cell_is_found_at_its_time(robot, arm, cell, lead):
 
 
 def test_a_cell_that_is_none_of_a_bus_is_led_by_the_arm_alone(arm, lead):
-    cell = RtdeWrench(read_force_config(Path("rtde_ur.yaml")), arm.state, arm.clock)
+    cell = RtdeWrench(read_force_config(Path("rtde_ur.yaml")), arm)
     clock = lead(cell)
     clock.wait_until(clock.now_ns() + CYCLE_NS)
     cell.start()
