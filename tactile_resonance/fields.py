@@ -88,6 +88,11 @@ def cut(text: str) -> str:
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 3]}..."
 
 
+def one_line(error: BaseException) -> str:
+    """Message of an error, or its kind where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def counted(count: int, thing: str, plural: str = "") -> str:
     """``1 point``, ``3 points``; with a plural of its own where that is not the thing and an s."""
     return f"{count} {thing}" if count == 1 else f"{count} {plural or thing + 's'}"

@@ -11,11 +11,12 @@ import time
 from binascii import Error as HexError
 from binascii import unhexlify
 from collections import deque
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import can
 
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
+from tactile_resonance.fields import one_line
 
 OPEN_WITHIN_S = 3.5  # serial adapters are given two seconds to wake up
 RATE_WINDOW_S = 0.5
@@ -51,31 +52,6 @@ class Frame(NamedTuple):
     arrival_ns: int
 
 
-class Bus(Protocol):
-    """An open bus."""
-
-    def read(self) -> list[Frame]:
-        """Frames since the last call, oldest first, without waiting. Raises what the interface raises."""
-        ...
-
-    @property
-    def drained(self) -> bool:
-        """Whether no more frames were waiting after the last read."""
-        ...
-
-    def wait(self, seconds: float) -> None:
-        """Return when frames have come, after a time at the latest."""
-        ...
-
-    def send(self, can_id: int, data: bytes, extended: bool) -> None:
-        """Send a frame. Raises what the interface raises."""
-        ...
-
-    def close(self) -> None:
-        """Disconnect."""
-        ...
-
-
 class SocketcandBus:
     """A bus over TCP (socketcand, raw mode): all frames that have come with one look at the socket.
 
@@ -91,6 +67,8 @@ class SocketcandBus:
     local_port : int
     frames : int
         Received since it was opened.
+    drained : bool
+        Whether no more frames were waiting after the last read.
 
     Raises
     ------
@@ -102,7 +80,7 @@ class SocketcandBus:
         self._socket = socket.create_connection((host, port), OPEN_WITHIN_S)
         self.local_port = int(self._socket.getsockname()[1])
         self.frames = 0
-        self._buffer, self._drained = b"", False
+        self._buffer, self.drained = b"", False
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._expect(b"< hi >", b"")
@@ -113,19 +91,14 @@ class SocketcandBus:
             raise
         self._socket.setblocking(False)
 
-    @property
-    def drained(self) -> bool:
-        """See `Bus`."""
-        return self._drained
-
     def read(self) -> list[Frame]:
-        """See `Bus`."""
+        """Frames since the last call, oldest first, without waiting. Raises what the interface raises."""
         try:
             data = self._socket.recv(_AT_ONCE)
         except BlockingIOError:
-            self._drained = True
+            self.drained = True
             return []
-        self._drained = len(data) < _AT_ONCE
+        self.drained = len(data) < _AT_ONCE
         if not data:
             raise ConnectionError("the server has closed the connection")
         received = self._buffer + data
@@ -153,17 +126,17 @@ class SocketcandBus:
         return frames
 
     def wait(self, seconds: float) -> None:
-        """See `Bus`."""
+        """Return when frames have come, after a time at the latest."""
         select.select([self._socket], [], [], seconds)
 
     def send(self, can_id: int, data: bytes, extended: bool) -> None:
-        """See `Bus`."""
+        """Send a frame. Raises what the interface raises."""
         name = f"{can_id:08X}" if extended else f"{can_id:03X}"
         values = " ".join(f"{byte:02X}" for byte in data)
         self._socket.sendall(f"< send {name} {len(data):X} {values} >".encode())
 
     def close(self) -> None:
-        """See `Bus`."""
+        """Disconnect."""
         self._socket.close()
 
     def _expect(self, answer: bytes, request: bytes) -> None:
@@ -189,6 +162,11 @@ class AnyBus:
         Identifier, data, whether extended, and period [s] of a frame that is sent again and again.
     look_s : float
         After so long without a frame nothing waits [s].
+
+    Attributes
+    ----------
+    drained : bool
+        See `SocketcandBus`.
     """
 
     def __init__(
@@ -205,7 +183,7 @@ class AnyBus:
         self._thread.start()
 
     def read(self) -> list[Frame]:
-        """See `Bus`."""
+        """See `SocketcandBus`."""
         self._came.clear()
         frames = []
         while self._frames:
@@ -217,15 +195,15 @@ class AnyBus:
         return frames
 
     def wait(self, seconds: float) -> None:
-        """See `Bus`."""
+        """See `SocketcandBus`."""
         self._came.wait(seconds)
 
     def send(self, can_id: int, data: bytes, extended: bool) -> None:
-        """See `Bus`."""
+        """See `SocketcandBus`."""
         self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=extended))
 
     def close(self) -> None:
-        """See `Bus`."""
+        """See `SocketcandBus`."""
         self._ended.set()
         self._thread.join(1.0)
         self._bus.shutdown()
@@ -258,6 +236,9 @@ class AnyBus:
             self._came.set()
 
 
+Bus = SocketcandBus | AnyBus
+
+
 def open_bus(
     settings: dict[str, Any],
     where: str,
@@ -281,15 +262,18 @@ def open_bus(
         `LINK_LOST`.
     """
     plain = set(settings) <= {"interface", "host", "port", "channel", "tcp_tune"}
-    if settings["interface"] == "socketcand" and plain and request is None:
-        try:
+    try:
+        if settings["interface"] == "socketcand" and plain and request is None:
             return SocketcandBus(settings["host"], settings["port"], settings["channel"])
-        except TimeoutError as error:
-            text = f"{where}: not open after {OPEN_WITHIN_S:g} s"
-            raise ForceError(ForceFault.LINK_LOST, text) from error
-        except (OSError, ValueError) as error:  # ValueError: what no name or address can be
-            text = f"{where}: {one_line(error)}"
-            raise ForceError(ForceFault.LINK_LOST, text) from error
+        return AnyBus(_opened(settings), request, look_s)
+    except Exception as error:  # each interface has errors of its own
+        late = type(error) is TimeoutError  # of a socket or a thread, not of an interface
+        text = f"not open after {OPEN_WITHIN_S:g} s" if late else one_line(error)
+        raise ForceError(ForceFault.LINK_LOST, f"{where}: {text}") from error
+
+
+def _opened(settings: dict[str, Any]) -> can.BusABC:
+    """A bus of python-can; `TimeoutError` where it is not open in time, and then let go once it is."""
     opened: list[can.BusABC] = []
     failed: list[Exception] = []
     given_up = threading.Event()
@@ -297,7 +281,7 @@ def open_bus(
     def open_bus() -> None:
         try:
             bus = can.Bus(**settings)
-        except Exception as error:  # each interface has errors of its own
+        except Exception as error:
             failed.append(error)
             return
         opened.append(bus)
@@ -308,13 +292,11 @@ def open_bus(
     opener.start()
     opener.join(OPEN_WITHIN_S)
     if failed:
-        text = f"{where}: {one_line(failed[0])}"
-        raise ForceError(ForceFault.LINK_LOST, text) from failed[0]
+        raise failed[0]
     if not opened:
         given_up.set()
-        text = f"{where}: not open after {OPEN_WITHIN_S:g} s"
-        raise ForceError(ForceFault.LINK_LOST, text)
-    return AnyBus(opened[0], request, look_s)
+        raise TimeoutError
+    return opened[0]
 
 
 class Flow:
@@ -340,8 +322,3 @@ class Flow:
         self._begin_s, self._count = now_s, count
         self._short = self._short + 1 if self.rate_hz < LEAST_SHARE * self._nominal_hz else 0
         return self._short > 1
-
-
-def one_line(error: BaseException) -> str:
-    """Message of an error, or its kind where it has none."""
-    return " ".join(str(error).split()) or type(error).__name__

@@ -23,11 +23,11 @@ from tactile_resonance.drivers.can_bus import (
     Flow,
     Frame,
     SocketcandBus,
-    one_line,
     open_bus,
 )
 from tactile_resonance.drivers.can_frames import CHANNELS, Assembler, CellCommand
 from tactile_resonance.drivers.force_config import CanForce
+from tactile_resonance.fields import one_line
 
 ANSWER_WITHIN_S = 0.25
 """Of a cell, on this machine's clock; of a simulated one on a machine that may be slow:"""

@@ -21,6 +21,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.drivers.nidaq_config import TERMINALS, InputChannel, NiDaqConfig
 from tactile_resonance.drivers.nidaq_scale import CountScale
+from tactile_resonance.fields import one_line
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel
 
@@ -323,7 +324,7 @@ def load(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as error:
         raise DeviceError(
-            f"nidaqmx: {_one_line(error)}; install the package with "
+            f"nidaqmx: {one_line(error)}; install the package with "
             "'pip install \"nidaqmx>=1.0,<2\"' and NI's driver NI-DAQmx"
         ) from error
 
@@ -355,8 +356,4 @@ def _reason(error: Exception) -> str:
         return f"overrun, blocks are lost: {_OVERRUN[code]}"
     if code == _NOT_YET_AVAILABLE:
         return "no samples in time: the clock does not run, or runs slowly"
-    return _one_line(error)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    return one_line(error)
