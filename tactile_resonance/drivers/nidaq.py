@@ -147,17 +147,14 @@ class NiDaqDevice:
             if self._closed:
                 raise DeviceError("nidaqmx: closed")
             self._close_tasks()
-            try:
-                with translated("arm"):
-                    # a reader may be late by the buffer, and two periods always fit
-                    late = round(self._config.buffer_s * self._rate_hz)
-                    self._input = self._make_input(max(late, 2 * period.size))
-                    self._output = self._make_output(period)
-                    commit = self._constants.TaskMode.TASK_COMMIT
-                    self._input.control(commit)
-                    self._output.control(commit)
-            except DeviceError as error:
-                raise self._stopped_after(error) from error
+            with self._stopping("arm"):
+                # a reader may be late by the buffer, and two periods always fit
+                late = round(self._config.buffer_s * self._rate_hz)
+                self._input = self._make_input(max(late, 2 * period.size))
+                self._output = self._make_output(period)
+                commit = self._constants.TaskMode.TASK_COMMIT
+                self._input.control(commit)
+                self._output.control(commit)
             self._armed = excitation
             self._drive = period
             self._index = 0
@@ -167,14 +164,11 @@ class NiDaqDevice:
         with self._lock:
             if self._armed is None or self._closed:
                 raise DeviceError("nidaqmx: nothing armed to play")
-            try:
-                with translated("play"):
-                    self._maybe_on = True
-                    self._output.start()
-                    self._input.start()
-                    self._start_ns = time.time_ns()
-            except DeviceError as error:
-                raise self._stopped_after(error) from error
+            with self._stopping("play"):
+                self._maybe_on = True
+                self._output.start()
+                self._input.start()
+                self._start_ns = time.time_ns()
 
     def interrupt(self) -> None:
         """Nothing: the library's call ends with its block."""
@@ -186,19 +180,16 @@ class NiDaqDevice:
             raise DeviceError("nidaqmx: nothing plays")
         n = excitation.samples_per_period
         raw = np.zeros((len(self._scales), n), self._raw_dtype)  # (channels, N)
-        try:
-            with translated(f"block {self._index + 1}"):
-                reader = self._readers.AnalogUnscaledReader(task.in_stream)
-                read = reader.read_int16 if self._raw_dtype is np.int16 else reader.read_int32
-                count = read(raw, number_of_samples_per_channel=n, timeout=timeout_s)
-                # an output that ran dry is silent on the input's side: this call raises its error
-                ended = output.is_task_done()
+        with self._stopping(f"block {self._index + 1}"):
+            reader = self._readers.AnalogUnscaledReader(task.in_stream)
+            read = reader.read_int16 if self._raw_dtype is np.int16 else reader.read_int32
+            count = read(raw, number_of_samples_per_channel=n, timeout=timeout_s)
+            # an output that ran dry is silent on the input's side: this call raises its error
+            ended = output.is_task_done()
             if count != n:
                 raise DeviceError(f"nidaqmx: block {self._index + 1}: {count} of {n} samples")
             if ended:
                 raise DeviceError(f"nidaqmx: block {self._index + 1}: the output has stopped")
-        except DeviceError as error:
-            raise self._stopped_after(error) from error
         channels = [scale.channel(row) for scale, row in zip(self._scales, raw, strict=True)]
         if not self._config.actuator:
             channels.insert(0, Channel(self._drive))
@@ -229,13 +220,15 @@ class NiDaqDevice:
             self._closed = True
             self.stop()
 
-    def _stopped_after(self, error: DeviceError) -> DeviceError:
-        """Stop, and say what went wrong, with what went wrong in stopping."""
+    @contextmanager
+    def _stopping(self, doing: str) -> Iterator[None]:
+        """As `translated`, and after an error stop; with what went wrong in stopping."""
         try:
-            self.stop()
-        except DeviceError as further:
-            return DeviceError(f"{error}; {further}")
-        return error
+            with translated(doing):
+                yield
+        except DeviceError as error:
+            further = attempt(doing, self.stop)
+            raise DeviceError("; ".join([str(error), *further])) from error
 
     def _make_input(self, samples: int) -> Any:
         """Inputs that run until stopped, with a buffer of this many samples per channel."""
@@ -253,7 +246,7 @@ class NiDaqDevice:
             if bits not in ({16}, {32}):
                 raise DeviceError(f"nidaqmx: raw samples of {sorted(bits)} bits, expected 16 or 32")
             self._raw_dtype = np.int16 if bits == {16} else np.int32
-            self._scales = [CountScale.of(channel, self._raw_dtype) for channel in channels]
+            self._scales = [CountScale(channel, self._raw_dtype) for channel in channels]
         except Exception:
             task.close()
             raise

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import polynomial
 
-from tactile_resonance._typing import FloatArray
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.record import Channel
 
@@ -21,10 +20,9 @@ class CountScale:
 
     Parameters
     ----------
-    coefficients : (K,) float
-        ``AIChannel.ai_dev_scaling_coeff``, K >= 2.
-    limits_v : (low, high)
-        Range of the device: a sample there or beyond is saturated.
+    channel : nidaqmx.task.channels.AIChannel
+        Its ``ai_dev_scaling_coeff`` are the coefficients, two or more; a sample at the ends of its range, or
+        beyond, is saturated.
     dtype : numpy.int16 or numpy.int32
         Of the raw samples.
 
@@ -34,29 +32,19 @@ class CountScale:
         If the coefficients have no slope.
     """
 
-    def __init__(
-        self,
-        coefficients: FloatArray,
-        limits_v: tuple[float, float],
-        dtype: type[np.signedinteger],
-    ) -> None:
+    def __init__(self, channel: Any, dtype: type[np.signedinteger]) -> None:
+        coefficients = np.array(channel.ai_dev_scaling_coeff, float)
         if coefficients.size < 2 or coefficients[1] == 0:
             raise DeviceError(f"nidaqmx: scaling coefficients {coefficients}, expected a slope")
         self._coefficients = coefficients
-        self._limits_v = limits_v
+        self._limits_v = float(channel.ai_rng_low), float(channel.ai_rng_high)
         self._ends = np.iinfo(dtype)
         offset_v, slope_v = coefficients[:2]
-        low, high = sorted((limit - offset_v) / slope_v for limit in limits_v)
+        low, high = sorted((limit - offset_v) / slope_v for limit in self._limits_v)
         counts = np.linspace(max(low, self._ends.min), min(high, self._ends.max), _PROBES)
         bend_v = polynomial.polyval(counts, coefficients) - (offset_v + slope_v * counts)
         # a bend that no count could show is none
         self.is_straight = bool(np.max(np.abs(bend_v)) <= 0.5 * abs(slope_v))
-
-    @classmethod
-    def of(cls, channel: Any, dtype: type[np.signedinteger]) -> CountScale:
-        """That of an ``AIChannel``."""
-        coefficients = np.array(channel.ai_dev_scaling_coeff, float)
-        return cls(coefficients, (float(channel.ai_rng_low), float(channel.ai_rng_high)), dtype)
 
     def channel(self, counts: npt.NDArray[np.signedinteger]) -> Channel:
         """(n,) counts as they are where a straight line converts them, else volts."""

@@ -4,6 +4,7 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -248,13 +249,20 @@ def test_saturation_is_flagged(hardware):
     assert not block.sensor.saturated
 
 
+def scale_of(*coefficients):
+    channel = SimpleNamespace(
+        ai_dev_scaling_coeff=list(coefficients), ai_rng_low=-10.0, ai_rng_high=10.0
+    )
+    return CountScale(channel, np.int16)
+
+
 def test_counts_where_the_converter_is_straight_else_volts():
     counts = np.array([-30000, 0, 12345], np.int16)
-    straight = CountScale(np.array([0.01, 3e-4, 1e-15]), (-10.0, 10.0), np.int16)
+    straight = scale_of(0.01, 3e-4, 1e-15)
     channel = straight.channel(counts)
     assert channel.is_counts
     np.testing.assert_allclose(channel.volts(), 0.01 + 3e-4 * counts, rtol=1e-15)
-    bent = CountScale(np.array([0.01, 3e-4, 1e-12, 1e-16]), (-10.0, 10.0), np.int16)
+    bent = scale_of(0.01, 3e-4, 1e-12, 1e-16)
     channel = bent.channel(counts)
     assert not channel.is_counts
     x = counts.astype(float)
@@ -262,7 +270,7 @@ def test_counts_where_the_converter_is_straight_else_volts():
     for end in (-(2**15), 2**15 - 1):
         assert straight.channel(np.array([end], np.int16)).saturated
     with pytest.raises(DeviceError, match="expected a slope"):
-        CountScale(np.array([0.0, 0.0]), (-10.0, 10.0), np.int16)
+        scale_of(0.0, 0.0)
 
 
 def test_wide_converters_are_read_as_such(hardware):
