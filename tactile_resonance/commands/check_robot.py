@@ -43,24 +43,12 @@ def run(options: argparse.Namespace) -> int:
         config = dataclasses.replace(config, host=options.host)
     try:
         if config.check_dashboard:
-            robot = identify(config.host)
-            print(
-                f"{robot.model}, PolyScope {robot.version}; {robot.robot_mode}; {robot.safety_status}"
-            )
-            print(f"remote control: {'yes' if robot.remote_control else 'NO'}")
-        report = watch(config, options.seconds)
+            print(identify(config.host))
+        lines, fit = watch(config, options.seconds)
     except ArmError as error:
         raise ValueError(f"{error} ({error.fault.value})") from error
-    limit_ms = config.max_state_age_s * 1e3
-    print(f"states: {report.rate_hz:.1f} Hz over {report.duration_s:.1f} s, {report.missed} missed")
-    print(f"longest gap: {report.longest_gap_s * 1e3:.0f} ms")
-    print(
-        f"age: median {report.age_median_s * 1e3:.1f}, 99 % {report.age_p99_s * 1e3:.1f}, "
-        f"largest {report.age_max_s * 1e3:.1f} ms; limit {limit_ms:.0f} ms, beyond it "
-        f"{report.stale} times"
-    )
-    print(f"clock of the robot: known to {report.clock_uncertainty_s * 1e3:.2f} ms (1 sigma)")
-    if report.stale:
+    print(lines)
+    if not fit:
         print("NOT FIT: states came too late; see 'The network' in docs/robot.md")
         return 1
     print("fit: no state came too late")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,62 +15,17 @@ from tactile_resonance.drivers.ur_config import UrArmConfig
 POLL_S = 0.0005
 
 
-@dataclass(frozen=True)
-class RobotIdentity:
-    """Answers of the dashboard server: texts of the robot."""
-
-    model: str
-    version: str
-    robot_mode: str
-    safety_status: str
-    remote_control: bool
-
-
-@dataclass(frozen=True)
-class LinkReport:
-    """States received over a time without motion.
-
-    Attributes
-    ----------
-    duration_s : float
-        By the robot's clock.
-    rate_hz : float
-        Of states that were seen.
-    missed : int
-        States skipped, by the robot's time stamps.
-    longest_gap_s : float
-        Between the time stamps of two states seen one after the other.
-    age_median_s, age_p99_s, age_max_s : float
-        Of the newest state whenever it was asked for.
-    stale : int
-        How often it was older than the configuration accepts.
-    clock_uncertainty_s : float
-    """
-
-    duration_s: float
-    rate_hz: float
-    missed: int
-    longest_gap_s: float
-    age_median_s: float
-    age_p99_s: float
-    age_max_s: float
-    stale: int
-    clock_uncertainty_s: float
-
-
-def identify(host: str) -> RobotIdentity:
-    """Ask the dashboard server. Raises `ArmError` LINK_LOST where it does not answer."""
+def identify(host: str) -> str:
+    """What the dashboard server answers, in lines. Raises `ArmError` LINK_LOST where it does not."""
     import dashboard_client
 
     client = dashboard_client.DashboardClient(host)
     try:
         client.connect()
-        return RobotIdentity(
-            model=client.getRobotModel(),
-            version=client.polyscopeVersion(),
-            robot_mode=client.robotmode(),
-            safety_status=client.safetystatus(),
-            remote_control=client.isInRemoteControl(),
+        return (
+            f"{client.getRobotModel()}, PolyScope {client.polyscopeVersion()}; {client.robotmode()}; "
+            f"{client.safetystatus()}\n"
+            f"remote control: {'yes' if client.isInRemoteControl() else 'NO'}"
         )
     except RuntimeError as error:
         raise ArmError(
@@ -82,8 +36,16 @@ def identify(host: str) -> RobotIdentity:
             client.disconnect()
 
 
-def watch(config: UrArmConfig, seconds: float) -> LinkReport:
+def watch(config: UrArmConfig, seconds: float) -> tuple[str, bool]:
     """Connect with the control program, move nothing, and watch the states.
+
+    Returns
+    -------
+    lines : str
+        Rate and gaps by the robot's time stamps, age of the newest state whenever it was asked for, and how
+        well the robot's clock is known.
+    fit : bool
+        Whether no state was older than the configuration accepts.
 
     Raises
     ------
@@ -117,14 +79,13 @@ def watch(config: UrArmConfig, seconds: float) -> LinkReport:
         raise ArmError(ArmFault.STALE, f"{config.host}: no fresh states in {seconds:g} s")
     gaps = np.diff(stamps)
     duration_s = stamps[-1] - stamps[0]
-    return LinkReport(
-        duration_s=duration_s,
-        rate_hz=len(gaps) / duration_s,
-        missed=round(duration_s * config.rate_hz) - len(gaps),
-        longest_gap_s=float(gaps.max()),
-        age_median_s=float(np.median(ages)),
-        age_p99_s=float(np.quantile(ages, 0.99)),
-        age_max_s=float(max(ages)),
-        stale=stale,
-        clock_uncertainty_s=uncertainty_s,
+    missed = round(duration_s * config.rate_hz) - len(gaps)
+    median_ms, most_ms, largest_ms = 1e3 * np.quantile(ages, [0.5, 0.99, 1.0])
+    lines = (
+        f"states: {len(gaps) / duration_s:.1f} Hz over {duration_s:.1f} s, {missed} missed",
+        f"longest gap: {gaps.max() * 1e3:.0f} ms",
+        f"age: median {median_ms:.1f}, 99 % {most_ms:.1f}, largest {largest_ms:.1f} ms; limit "
+        f"{config.max_state_age_s * 1e3:.0f} ms, beyond it {stale} times",
+        f"clock of the robot: known to {uncertainty_s * 1e3:.2f} ms (1 sigma)",
     )
+    return "\n".join(lines), stale == 0

@@ -2,6 +2,7 @@
 """Ages of an arm's states are told on the arm's own clock."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -46,9 +47,13 @@ class Arm:
 
 def test_ages_and_gaps_are_those_of_the_states(monkeypatch):
     monkeypatch.setattr(ur_check, "UrArm", Arm)
-    report = ur_check.watch(UrArmConfig("127.0.0.1", Pose(np.zeros(3), np.zeros(3))), 0.2)
-    for age_s in (report.age_median_s, report.age_p99_s, report.age_max_s):
-        assert age_s == pytest.approx(5e-3)
-    assert report.longest_gap_s == pytest.approx(4e-3)
-    assert report.missed / (report.duration_s * 500) == pytest.approx(0.25, abs=0.02)
-    assert report.stale == 0
+    lines, fit = ur_check.watch(UrArmConfig("127.0.0.1", Pose(np.zeros(3), np.zeros(3))), 0.2)
+    assert fit
+    states, gap, age, clock = lines.split("\n")
+    rate_hz, seconds, missed = map(float, re.findall(r"[\d.]+", states))
+    assert rate_hz == pytest.approx(0.75 * 500, abs=0.02 * 500)
+    # the time is stated to 0.05 s
+    assert missed == pytest.approx(0.25 * 500 * seconds, abs=0.02 * 500 * seconds + 0.05 * 500)
+    assert gap == "longest gap: 4 ms"
+    assert age == "age: median 5.0, 99 % 5.0, largest 5.0 ms; limit 20 ms, beyond it 0 times"
+    assert clock == "clock of the robot: known to 0.10 ms (1 sigma)"
