@@ -80,7 +80,6 @@ class UrArm:
         self.heard_s = 0.0
         self.client: ClientProcess | None = None
         self._asked: SimulatedClock | None = None
-        self._stream: RtdeStream | None = None
         self._states: StateReader | None = None
         self._number = 0
         # number, kind and time [s] of commands without an answer yet
@@ -100,13 +99,12 @@ class UrArm:
     def clock_uncertainty_s(self) -> float:
         """Standard deviation of `ArmSample.time_ns` against `clock` [s]."""
         self._fresh()
-        assert self._states is not None
-        return self._states.clock_std_s
+        return self._reader.clock_std_s
 
     @property
     def robot_port(self) -> int:
         """Local port of the connection over which the robot sends its states; 0: none."""
-        return 0 if self._stream is None else self._stream.local_port
+        return 0 if self._states is None else self._states.stream.local_port
 
     # the contract
 
@@ -169,9 +167,9 @@ class UrArm:
         values = checked_twist(twist, self.config)
         check_acceleration(acceleration_m_s2, self.config)
         self.recent()
-        assert self._states is not None
-        if self._states.fault is not None:
-            raise ArmError(*self._states.fault)
+        fault = self._reader.fault
+        if fault is not None:
+            raise ArmError(*fault)
         self._send(SPEED, values, float(acceleration_m_s2))
 
     def stop(self, deceleration_m_s2: float) -> None:
@@ -216,14 +214,13 @@ class UrArm:
 
     def catch_up(self, robot_ns: int) -> None:
         """Wait for the state that the bench has sent, of a time of the robot [ns]."""
-        assert self._stream is not None
-        assert self._states is not None
+        states = self._reader
         self._looked_ns = 0
         self.receive(now_known=True)
-        while (newest := self._states.newest) is not None:
+        while (newest := states.newest) is not None:
             if round(newest.robot_time_s * 1e9) >= robot_ns:
                 return
-            select.select([self._stream], [], [], 0.1)
+            select.select([states.stream], [], [], 0.1)
             self.receive(now_known=True)
 
     def date_anew(self) -> bool:
@@ -233,6 +230,13 @@ class UrArm:
         return self._states is not None
 
     # helpers
+
+    @property
+    def _reader(self) -> StateReader:
+        """Of the connection; `ArmError` where there is none."""
+        if self._states is None:
+            raise ArmError(ArmFault.LINK_LOST, "not connected")
+        return self._states
 
     def _connect_again(self) -> bool:
         """Start the program again over a good connection; False where everything must be reconnected."""
@@ -244,12 +248,11 @@ class UrArm:
                 self.client.end()
             self._forget()
             return False
-        assert self._states is not None
-        if self._states.fault is None:
+        if self._reader.fault is None:
             self._forget_commands()
             return True
         self._check_stop()
-        self._states.guard(False)
+        self._reader.guard(False)
         self._ask({"name": "restart"})
         self._guard()
         if self.led is not None:
@@ -262,10 +265,10 @@ class UrArm:
             if self.time_server and self._asked is None:
                 self._asked = SimulatedClock(self.time_server, f"{client_name()}: owner")
                 self.clock = AskedClock(self._asked)
-            self._stream = RtdeStream(self.config.host, self.config.rate_hz)
-            trip_s = 0.0 if self.time_server else self._stream.round_trip_s
-            self._states = StateReader(self._stream, lambda: self.clock.now_ns(), trip_s)
-            self._wait_for_first()
+            stream = RtdeStream(self.config.host, self.config.rate_hz)
+            trip_s = 0.0 if self.time_server else stream.round_trip_s
+            self._states = StateReader(stream, lambda: self.clock.now_ns(), trip_s)
+            self._wait_for(lambda states: states.newest is not None, "no state of the robot comes")
             self._check_stop()
         except ConnectionError as error:
             self._forget()
@@ -276,17 +279,13 @@ class UrArm:
 
     def _guard(self) -> None:
         """Wait until the program runs; from now on no other counts as ours."""
-        assert self._states is not None
         self._wait_for(
             lambda states: states.newest.runtime_state == PROGRAM_PLAYING,
             "the program ended as soon as it ran",
             ArmFault.PROGRAM_NOT_STARTED,
         )
-        self._states.guard(True)
+        self._reader.guard(True)
         self._forget_commands()
-
-    def _wait_for_first(self) -> None:
-        self._wait_for(lambda states: states.newest is not None, "no state of the robot comes")
 
     def _wait_for(
         self,
@@ -294,19 +293,16 @@ class UrArm:
         otherwise: str,
         fault: ArmFault = ArmFault.LINK_LOST,
     ) -> None:
-        assert self._stream is not None
-        assert self._states is not None
-        deadline = time.monotonic() + BEGIN_S
-        while not condition(self._states):
+        states, deadline = self._reader, time.monotonic() + BEGIN_S
+        while not condition(states):
             if time.monotonic() > deadline:
                 raise ArmError(fault, otherwise)
-            select.select([self._stream], [], [], 0.05)
+            select.select([states.stream], [], [], 0.05)
             self.receive()
 
     def _check_stop(self) -> None:
         """Raise where something forbids motion whatever program runs."""
-        assert self._states is not None
-        newest = self._states.newest
+        newest = self._reader.newest
         assert newest is not None
         stop = stop_fault(newest.safety_bits, newest.robot_mode)
         if stop is not None:  # not released yet
@@ -342,10 +338,10 @@ class UrArm:
 
     def receive(self, now_known: bool = False) -> None:
         """Take the states that have come; `now_known`: the loop that leads has received the present time."""
-        assert self._states is not None
+        states = self._reader
         try:
             with self._reading:  # a loop may wait for a time while another thread connects
-                if self._states.read(now_known or self.led is None):
+                if states.read(now_known or self.led is None):
                     self.heard_s = time.monotonic()
         except ConnectionError as error:
             if self.client is not None:
@@ -357,9 +353,9 @@ class UrArm:
     def _fresh(self) -> ArmSample:
         """Return the newest state, and give the client a sign of life."""
         self._looked_ns = 0
-        if self.client is None or self._states is None:
+        client, states, config = self.client, self._reader, self.config
+        if client is None:
             raise ArmError(ArmFault.LINK_LOST, "not connected")
-        client, states, config = self.client, self._states, self.config
         self.receive()
         sample = states.sample
         assert sample is not None
@@ -369,7 +365,7 @@ class UrArm:
             seen |= FAULTY | REVIVED if states.revived else FAULTY
         client.look(seen)
         if age_s > GIVE_UP_S:
-            self.client.end()
+            client.end()
             self._forget()
             raise ArmError(ArmFault.LINK_LOST, f"the connection to {config.host} is lost")
         if age_s > config.max_state_age_s:
@@ -383,14 +379,13 @@ class UrArm:
 
     def _check_commands(self) -> None:
         assert self.client is not None
-        assert self._states is not None
         sent, (done, refused) = self._sent, self.client.exchange.answered
         while sent and sent[0][0] <= done:
             number, kind, _ = sent.popleft()
             if number != refused or number <= self._refused:
                 continue
             self._refused = number
-            if self._states.fault is not None:
+            if self._reader.fault is not None:
                 return  # because of a stop, which the state reports
             name = {SPEED: "speed", STOP: "stop"}[kind]
             said = self.client.last_error()
@@ -409,7 +404,6 @@ class UrArm:
 
     def _forget(self) -> None:
         """Nothing is connected any more."""
-        self.client = self._states = None
-        if self._stream is not None:
-            self._stream.close()
-            self._stream = None
+        states, self.client, self._states = self._states, None, None
+        if states is not None:
+            states.stream.close()

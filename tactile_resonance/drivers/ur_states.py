@@ -77,6 +77,7 @@ class StateReader:
 
     Attributes
     ----------
+    stream : RtdeStream
     newest : RobotState or None
     sample : ArmSample or None
         The same state, as the contract of an arm has it.
@@ -88,7 +89,7 @@ class StateReader:
         self.newest: RobotState | None = None
         self.sample: ArmSample | None = None
         self.fault: tuple[ArmFault, str] | None = None
-        self._stream, self._now_ns, self._trip_s = stream, now_ns, round_trip_s
+        self.stream, self._now_ns, self._trip_s = stream, now_ns, round_trip_s
         self._tracker = self._new_tracker()
         self._guarded = self._ended = False
 
@@ -116,7 +117,7 @@ class StateReader:
 
         Where the present time is not known, states are dated by the relation of the clocks found before.
         """
-        states = self._stream.read()
+        states = self.stream.read()
         if not states:
             return False
         if self._guarded:

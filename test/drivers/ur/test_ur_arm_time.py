@@ -52,7 +52,8 @@ def test_each_tick_sees_exactly_the_state_of_its_time(robot, high):
 
 
 def test_a_state_that_is_handed_over_late_is_waited_for(high, monkeypatch):
-    monkeypatch.setattr(high._stream, "_socket", LateSocket(high._stream._socket, 0.01))
+    stream = high._states.stream
+    monkeypatch.setattr(stream, "_socket", LateSocket(stream._socket, 0.01))
     high.speed(UP, ACCELERATION_M_S2)
     first = high.state().robot_time_s
     for n in range(1, 30):
