@@ -134,16 +134,15 @@ class Observer:
         self.taring = False
         p = self.parameters
         try:
-            look = tare(self._unloaded, p)
+            look, noise = tare(self._unloaded, p, now_ns)
         except TareError as error:
             return Breach(Cause.TARE, str(error))
-        noise = float(look.noise_rms_n[2])
         if noise < QUIETEST_SHARE * p.cell_noise_n:
             text = f"tare: noise of {1e3 * noise:.2g} mN rms, the source states"
             return Breach(Cause.TARE, f"{text} {1e3 * p.cell_noise_n:g} mN: does it still measure?")
-        zero: Zero | None = Zero(look.force_n, look.force_std_n, now_ns)
+        zero: Zero | None = look
         if before is not None:
-            zero = before.with_look(look, now_ns, p.zero_walk_n_per_sqrt_s)
+            zero = before.with_look(look, p.zero_walk_n_per_sqrt_s)
             if zero is not None and zero.std_n.max() > p.zero_std_n:
                 zero = None
         if zero is None:
@@ -154,7 +153,7 @@ class Observer:
         self.noise_n = max(LEAST_NOISE_N, noise)
         self.bias_std_n = float(zero.std_n[2])
         # neighbouring forces that are alike make means less certain than white noise would
-        inflation = float(look.force_std_n[2]) * math.sqrt(len(self._unloaded)) / noise
+        inflation = float(look.std_n[2]) * math.sqrt(len(self._unloaded)) / noise
         self._inflation = max(1.0, inflation)
         self.seek_touch()
         return None

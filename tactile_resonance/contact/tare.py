@@ -25,33 +25,62 @@ class TareError(ValueError):
     """The zero cannot be relied on; the message says why."""
 
 
+STEPPED = 4.0
+"""Deviations beyond which the zero has not walked, but stepped."""
+
+
 @dataclass(frozen=True)
-class Tare:
-    """A zero.
+class Zero:
+    """What was known of the zero.
 
     Attributes
     ----------
     force_n : (3,) array
-        Mean reading without contact.
-    force_std_n : (3,) array
-        Standard deviation of that mean, with the correlation of the samples.
-    noise_rms_n : (3,) array
-        Of one sample about the line through all.
-    drift_n_per_s, drift_std_n_per_s : (3,) arrays
+        Mean reading without contact, in the frame `tip`.
+    std_n : (3,) array
+        Of that mean, with the correlation of the samples.
+    time_ns : int
+        When, on the clock of the samples.
     """
 
     force_n: FloatArray
-    force_std_n: FloatArray
-    noise_rms_n: FloatArray
-    drift_n_per_s: FloatArray
-    drift_std_n_per_s: FloatArray
+    std_n: FloatArray
+    time_ns: int
+
+    def with_look(self, look: Zero, walk_n_per_sqrt_s: float) -> Zero | None:
+        """The zero after one more look at it; None where it has stepped.
+
+        Parameters
+        ----------
+        look : Zero
+            From forces in air alone.
+        walk_n_per_sqrt_s : float
+            Of the random walk [N/sqrt(s)].
+        """
+        passed_s = max(0.0, (look.time_ns - self.time_ns) * 1e-9)
+        variance = self.std_n**2 + walk_n_per_sqrt_s**2 * passed_s
+        seen = look.std_n**2
+        off = look.force_n - self.force_n
+        if np.any(off**2 > STEPPED**2 * (variance + seen)):
+            return None
+        gain = variance / (variance + seen)
+        return Zero(self.force_n + gain * off, np.sqrt(gain * seen), look.time_ns)
 
 
-def tare(samples: Sequence[WrenchSample], parameters: ContactParameters) -> Tare:
+def tare(
+    samples: Sequence[WrenchSample], parameters: ContactParameters, time_ns: int
+) -> tuple[Zero, float]:
     """Zero from samples without contact, refused beyond the limits that the parameters state for each axis.
 
     The standard deviation of the mean takes the correlation of neighbouring samples into account: a filter
     in the sensor makes it no smaller than it is.
+
+    Returns
+    -------
+    zero : Zero
+        At the time given [ns].
+    noise_n : float
+        Along the normal, of one sample about the line through all [N rms].
 
     Raises
     ------
@@ -79,9 +108,10 @@ def tare(samples: Sequence[WrenchSample], parameters: ContactParameters) -> Tare
     inflation = _inflation(residual)
     mean_std = inflation * rms / math.sqrt(n)
     slope_std = inflation * rms / math.sqrt(t @ t)
-    result = Tare(mean, mean_std, rms, slope, slope_std)
-    _check(result, parameters)
-    return result
+    figures = np.stack([mean, mean_std, rms, slope, slope_std], axis=1).tolist()
+    for name, of_axis in zip("xyz", figures, strict=True):
+        _check(parameters, name, *of_axis)
+    return Zero(mean, mean_std, time_ns), float(rms[2])
 
 
 def _inflation(residual: FloatArray) -> FloatArray:
@@ -97,72 +127,33 @@ def _inflation(residual: FloatArray) -> FloatArray:
     return np.sqrt((1 + r) / (1 - r))
 
 
-def _check(result: Tare, parameters: ContactParameters) -> None:
-    p = parameters
-    for axis, name in enumerate("xyz"):
-        rms, std = float(result.noise_rms_n[axis]), float(result.force_std_n[axis])
-        drift, drift_std = float(result.drift_n_per_s[axis]), float(result.drift_std_n_per_s[axis])
-        zero = float(result.force_n[axis])
-        if rms > 1.5 * p.cell_noise_n:
-            raise TareError(
-                f"tare: noise of F{name} {rms * 1e3:.3g} mN rms, the source states "
-                f"{p.cell_noise_n * 1e3:.3g} mN: does something touch or shake?"
-            )
-        # what is no more than noise is not called drift
-        if abs(drift) - 3 * drift_std > p.tare_drift_n_per_s:
-            raise TareError(
-                f"tare: F{name} drifts by {drift * 1e3:.3g} +- {drift_std * 1e3:.2g} mN/s, accepted are "
-                f"{p.tare_drift_n_per_s * 1e3:.3g} mN/s"
-            )
-        if std > p.tare_std_n:
-            raise TareError(
-                f"tare: zero of F{name} uncertain by {std * 1e3:.3g} mN, accepted are "
-                f"{p.tare_std_n * 1e3:.3g} mN: take more samples"
-            )
-        if abs(zero) > p.tare_offset_n:
-            raise TareError(
-                f"tare: F{name} reads {zero * 1e3:.4g} mN without contact, accepted are up to "
-                f"{p.tare_offset_n * 1e3:.4g} mN (tare_offset_n): does something press or pull?"
-            )
-
-
-STEPPED = 4.0
-"""Deviations beyond which the zero has not walked, but stepped."""
-
-
-@dataclass(frozen=True)
-class Zero:
-    """What was known of the zero.
-
-    Attributes
-    ----------
-    force_n : (3,) array
-        In the frame `tip`.
-    std_n : (3,) array
-    time_ns : int
-        When, on the clock of the samples.
-    """
-
-    force_n: FloatArray
-    std_n: FloatArray
-    time_ns: int
-
-    def with_look(self, look: Tare, time_ns: int, walk_n_per_sqrt_s: float) -> Zero | None:
-        """The zero after one more look at it; None where it has stepped.
-
-        Parameters
-        ----------
-        look : Tare
-            Forces in air.
-        time_ns : int
-        walk_n_per_sqrt_s : float
-            Of the random walk [N/sqrt(s)].
-        """
-        passed_s = max(0.0, (time_ns - self.time_ns) * 1e-9)
-        variance = self.std_n**2 + walk_n_per_sqrt_s**2 * passed_s
-        seen = look.force_std_n**2
-        off = look.force_n - self.force_n
-        if np.any(off**2 > STEPPED**2 * (variance + seen)):
-            return None
-        gain = variance / (variance + seen)
-        return Zero(self.force_n + gain * off, np.sqrt(gain * seen), time_ns)
+def _check(
+    p: ContactParameters,
+    name: str,
+    zero: float,
+    std: float,
+    rms: float,
+    drift: float,
+    drift_std: float,
+) -> None:
+    if rms > 1.5 * p.cell_noise_n:
+        raise TareError(
+            f"tare: noise of F{name} {rms * 1e3:.3g} mN rms, the source states "
+            f"{p.cell_noise_n * 1e3:.3g} mN: does something touch or shake?"
+        )
+    # what is no more than noise is not called drift
+    if abs(drift) - 3 * drift_std > p.tare_drift_n_per_s:
+        raise TareError(
+            f"tare: F{name} drifts by {drift * 1e3:.3g} +- {drift_std * 1e3:.2g} mN/s, accepted are "
+            f"{p.tare_drift_n_per_s * 1e3:.3g} mN/s"
+        )
+    if std > p.tare_std_n:
+        raise TareError(
+            f"tare: zero of F{name} uncertain by {std * 1e3:.3g} mN, accepted are "
+            f"{p.tare_std_n * 1e3:.3g} mN: take more samples"
+        )
+    if abs(zero) > p.tare_offset_n:
+        raise TareError(
+            f"tare: F{name} reads {zero * 1e3:.4g} mN without contact, accepted are up to "
+            f"{p.tare_offset_n * 1e3:.4g} mN (tare_offset_n): does something press or pull?"
+        )

@@ -39,33 +39,35 @@ def test_the_stated_uncertainty_is_that_of_the_mean(keep):
     z = []
     for seed in range(300):
         limits = replace(LIMITS, tare_drift_n_per_s=1.0)
-        zero = tare(samples(400, seed=seed, keep=keep), limits)
-        z.append((zero.force_n - ZERO_N) / zero.force_std_n)
+        zero, _ = tare(samples(400, seed=seed, keep=keep), limits, 0)
+        z.append((zero.force_n - ZERO_N) / zero.std_n)
     # chi square over 900 values, five standard errors; the correlation is estimated too: one more tenth
     assert np.mean(np.square(z)) == pytest.approx(1.0, abs=0.1 + 5 * math.sqrt(2 / 900))
 
 
 def test_it_is_the_mean_of_what_was_read():
     readings = samples()
-    zero = tare(readings, LIMITS)
+    zero, noise_n = tare(readings, LIMITS, 7)
     np.testing.assert_allclose(zero.force_n, np.mean([s.force_n for s in readings], axis=0))
+    assert noise_n == pytest.approx(1e-3, rel=0.2)
+    assert zero.time_ns == 7
 
 
 def test_noise_beyond_the_stated_is_refused_with_the_figures():
     with pytest.raises(TareError, match=r"noise of Fx .* mN rms, the source states 1 mN"):
-        tare(samples(rms=2e-3), LIMITS)
+        tare(samples(rms=2e-3), LIMITS, 0)
 
 
 def test_drift_is_refused():
     with pytest.raises(TareError, match=r"Fx drifts by 10.* mN/s, accepted are 2 mN/s"):
-        tare(samples(drift=0.010, rms=1e-4), LIMITS)
+        tare(samples(drift=0.010, rms=1e-4), LIMITS, 0)
 
 
 def test_what_is_noise_is_not_called_drift():
     refused = 0
     for seed in range(200):
         try:
-            tare(samples(100, seed=seed), LIMITS)
+            tare(samples(100, seed=seed), LIMITS, 0)
         except TareError:
             refused += 1
     # 0.1 s of 1 mN noise has a slope of 3.5 mN/s rms
@@ -74,7 +76,7 @@ def test_what_is_noise_is_not_called_drift():
 
 def test_too_few_samples_for_the_zero_asked_for_are_refused():
     with pytest.raises(TareError, match="take more samples"):
-        tare(samples(30), replace(LIMITS, tare_std_n=5e-5))
+        tare(samples(30), replace(LIMITS, tare_std_n=5e-5), 0)
 
 
 @pytest.mark.parametrize(
@@ -87,9 +89,9 @@ def test_too_few_samples_for_the_zero_asked_for_are_refused():
 )
 def test_what_is_no_measurement_is_refused(readings, reason):
     with pytest.raises(TareError, match=reason):
-        tare(readings, LIMITS)
+        tare(readings, LIMITS, 0)
 
 
 def test_an_offset_that_no_bias_explains_is_refused():
     with pytest.raises(TareError, match=r"Fx reads .* without contact, accepted are up to 15 mN"):
-        tare(samples(), replace(LIMITS, tare_offset_n=0.015))
+        tare(samples(), replace(LIMITS, tare_offset_n=0.015), 0)

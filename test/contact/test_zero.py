@@ -4,14 +4,13 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.tare import Tare, Zero
+from tactile_resonance.contact.tare import Zero
 
 WALK, STD_N, EVERY_S = 5e-5, 9e-5, 2.5
 
 
-def look(force_n, std_n=STD_N):
-    nothing = np.zeros(3)
-    return Tare(np.asarray(force_n, float), np.full(3, std_n), np.full(3, 1e-3), nothing, nothing)
+def look(force_n, time_ns):
+    return Zero(np.asarray(force_n, float), np.full(3, STD_N), time_ns)
 
 
 def test_deviation_of_a_zero_that_walks_is_honest_and_below_that_of_one_look():
@@ -22,10 +21,8 @@ def test_deviation_of_a_zero_that_walks_is_honest_and_below_that_of_one_look():
         zero = Zero(true + STD_N * rng.standard_normal(3), np.full(3, STD_N), 0)
         for k in range(1, 9):
             true = true + WALK * np.sqrt(EVERY_S) * rng.standard_normal(3)
-            seen = look(true + STD_N * rng.standard_normal(3))
-            zero = zero.with_look(seen, round(k * EVERY_S * 1e9), WALK) or Zero(
-                seen.force_n, seen.force_std_n, round(k * EVERY_S * 1e9)
-            )
+            seen = look(true + STD_N * rng.standard_normal(3), round(k * EVERY_S * 1e9))
+            zero = zero.with_look(seen, WALK) or seen
         z.append((zero.force_n - true) / zero.std_n)
         stds.append(zero.std_n)
     # chi square over 900 values, five standard errors
@@ -38,7 +35,7 @@ def test_deviation_of_a_zero_that_walks_is_honest_and_below_that_of_one_look():
 
 
 def test_long_after_it_was_known_a_zero_is_that_of_the_look():
-    zero = Zero(np.zeros(3), np.full(3, 1e-6), 0).with_look(look([2e-4, 0, 0]), 10**13, WALK)
+    zero = Zero(np.zeros(3), np.full(3, 1e-6), 0).with_look(look([2e-4, 0, 0], 10**13), WALK)
     np.testing.assert_allclose(zero.force_n, [2e-4, 0, 0], rtol=1e-3)
     np.testing.assert_allclose(zero.std_n, STD_N, rtol=1e-3)
 
@@ -50,13 +47,13 @@ def test_a_zero_that_stepped_is_not_known(axis):
     for share, known in ((3.9, True), (4.1, False)):
         force_n = np.zeros(3)
         force_n[axis] = share * spread
-        assert (before.with_look(look(force_n), 10**9, WALK) is not None) == known
+        assert (before.with_look(look(force_n, 10**9), WALK) is not None) == known
 
 
 def test_looks_never_make_it_less_certain():
     zero = Zero(np.zeros(3), np.full(3, 1e-3), 0)
     for k in range(1, 20):
-        before, zero = zero, zero.with_look(look(np.zeros(3)), k, 0.0)
+        before, zero = zero, zero.with_look(look(np.zeros(3), k), 0.0)
         assert np.all(zero.std_n < before.std_n)
     # without a walk it is the weighted mean of all
     assert zero.std_n[0] == pytest.approx((1e6 + 19 / STD_N**2) ** -0.5)
