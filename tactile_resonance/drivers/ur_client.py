@@ -21,7 +21,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import zip_longest
 from typing import Any, NoReturn
 
@@ -145,21 +145,19 @@ class Client:
             self._exchange.hear(command.until_ns)
 
     def _request(self, request: dict) -> None:
-        """Do what the owner asks for, and answer."""
-        name = request["name"]
-        actions: dict[str, Callable[[], None]] = {
-            "connect": lambda: self._connect(request),
-            "restart": self._restart,
-            "lead": lambda: self._lead(True),
-            "follow": lambda: self._lead(False),
-        }
+        """Do what the owner asks for, and answer; simulated time stands afterwards."""
+        answer: dict = {"ok": True}
         try:
-            with self._time_passes(name in ("connect", "restart")):
-                actions[name]()
-            answer: dict = {"ok": True}
+            if request["name"] == "connect":
+                self._connect(request)
+            elif request["name"] == "restart":
+                self._restart()
+            else:
+                self._led = request["name"] == "lead"
         except ArmError as error:
             text = str(error)[len("arm: ") :]
             answer = {"ok": False, "fault": error.fault.value, "message": text}
+        self._stand()
         self._commands.send(json.dumps(answer).encode())
 
     def _connect(self, request: dict) -> None:
@@ -173,23 +171,10 @@ class Client:
 
     def _restart(self) -> None:
         assert self._session is not None
+        if self._clock is not None:
+            self._clock.free(Demand.REAL)
         self._session.restart()
         self._owed = None
-
-    def _lead(self, led: bool) -> None:
-        self._led = led
-        self._stand()
-
-    @contextlib.contextmanager
-    def _time_passes(self, wanted: bool) -> Iterator[None]:
-        """Let simulated time go on while the library waits for the robot; it stands afterwards."""
-        if self._clock is not None and wanted:
-            self._clock.free(Demand.REAL)
-        try:
-            yield
-        finally:
-            if wanted:
-                self._stand()
 
     def _stand(self) -> None:
         """Let simulated time stand until the owner sends how far it may go."""

@@ -120,7 +120,8 @@ class ClientProcess:
                 meanwhile()
                 if time.monotonic() > deadline:
                     self._kill()
-                    raise ArmError(ArmFault.LINK_LOST, self._late)
+                    text = f"{self._host} is not ready after {self._connect_timeout_s:g} s"
+                    raise ArmError(ArmFault.LINK_LOST, text)
             data = self._commands.recv(8192)
         except OSError:
             data = b""
@@ -154,10 +155,6 @@ class ClientProcess:
             self._ended = True
             for resource in (self._commands, self.exchange, self._errors):
                 resource.close()
-
-    @property
-    def _late(self) -> str:
-        return f"{self._host} is not ready after {self._connect_timeout_s:g} s"
 
     def _death(self) -> ArmError:
         """Why the client process is gone."""
