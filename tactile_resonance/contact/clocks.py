@@ -42,18 +42,12 @@ class ClockTracker:
     ----------
     shortest_delay_s, delay_std_s : float
         Of a message on its way [s], and how well that is known (one standard deviation).
-
-    Attributes
-    ----------
-    restarts : int
-        How often the remote clock was found set anew, or its sender to have stood still.
     """
 
     def __init__(self, shortest_delay_s: float = 0.0, delay_std_s: float = 0.0) -> None:
         for name, value in (("shortest_delay_s", shortest_delay_s), ("delay_std_s", delay_std_s)):
             require(0 <= value < math.inf, name, value, "a number, 0 or above")
         self._delay_s, self._delay_std_s = shortest_delay_s, delay_std_s
-        self.restarts = 0
         self._clear()
 
     def _clear(self) -> None:
@@ -85,7 +79,6 @@ class ClockTracker:
             offset_s, drift = self._line
             if remote_s < self._last_s or (self._blocks and offset_s + drift * x - y > STEP_S):
                 self._clear()
-                self.restarts += 1
         if self._origin is None:
             self._origin = (remote_s, local_ns)
             self._block_end_s = BLOCK_S
@@ -101,11 +94,6 @@ class ClockTracker:
             self._block = (x, y)
             if not self._blocks:
                 self._line = (y, 0.0)
-
-    @property
-    def drift(self) -> float:
-        """Rate of the local clock per remote clock, minus 1."""
-        return self._line[1]
 
     @property
     def uncertainty_s(self) -> float:
@@ -137,7 +125,6 @@ class ClockTracker:
         late = [y - self._line[0] - self._line[1] * x for x, y in recent]
         if len(self._blocks) > STEP_BLOCKS and min(late) > STEP_S:
             self._blocks = deque(recent, maxlen=WINDOW_BLOCKS)
-            self.restarts += 1
 
     def _fit(self) -> None:
         points = list(self._blocks)

@@ -39,8 +39,9 @@ def test_the_error_is_within_the_stated_uncertainty(seconds, drift):
 
 def test_drift_is_found():
     tracker = ClockTracker(SHORTEST_S)
-    feed(tracker, 40.0, 8e-5, 1)
-    assert tracker.drift == pytest.approx(8e-5, abs=2e-6)
+    remote_s, _ = feed(tracker, 40.0, 8e-5, 1)
+    took_ns = tracker.to_local_ns(remote_s + 1.0) - tracker.to_local_ns(remote_s)
+    assert took_ns * 1e-9 - 1.0 == pytest.approx(8e-5, abs=2e-6)
 
 
 def test_an_unknown_shortest_delay_stays_in_the_uncertainty():
@@ -58,7 +59,6 @@ def test_messages_held_up_for_seconds_do_not_move_it():
     for i in range(100):
         tracker.add(REMOTE_S + 10.0 + i / 500, START_NS + round((10.0 + 2.0 + i / 1e5) * 1e9))
     assert abs(tracker.to_local_ns(REMOTE_S + 11) - before_ns) < 1e5
-    assert tracker.restarts == 0
 
 
 def test_a_remote_clock_set_anew_is_followed_at_once():
@@ -66,7 +66,6 @@ def test_a_remote_clock_set_anew_is_followed_at_once():
     feed(tracker, 5.0, 0.0, 4)
     for i in range(500):
         tracker.add(3.0 + i / 500, START_NS + round((8 + i / 500 + SHORTEST_S) * 1e9))
-    assert tracker.restarts == 1
     assert tracker.to_local_ns(3.0) == pytest.approx(START_NS + 8 * 10**9, abs=1e4)
 
 
@@ -75,7 +74,6 @@ def test_a_sender_that_stood_still_is_followed_within_two_seconds():
     feed(tracker, 10.0, 0.0, 5)
     remote_s, true_ns = feed(tracker, 2.0, 0.0, 6, begin_s=10.0, stood_still_s=0.5)
     error_s = (tracker.to_local_ns(remote_s) - true_ns) * 1e-9
-    assert tracker.restarts == 1
     assert abs(error_s) < 3 * tracker.uncertainty_s
 
 
