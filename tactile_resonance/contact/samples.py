@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 
+def _read_three(value: object, field: str) -> FloatArray:
+    return np.array(numbers(value, field, 3))
+
+
 @dataclass(frozen=True)
 class Pose:
     """A pose as Universal Robots write it.
@@ -41,8 +45,8 @@ class Pose:
         Rotation vector: axis times angle [rad].
     """
 
-    position_m: FloatArray
-    rotation_rad: FloatArray
+    position_m: Annotated[FloatArray, _read_three]
+    rotation_rad: Annotated[FloatArray, _read_three]
 
     @classmethod
     def at_origin(cls) -> Pose:

@@ -17,7 +17,7 @@ from tactile_resonance.contact.interfaces import ForceInfo, Mount
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.tip_force import Mounting
-from tactile_resonance.contact.vectors import Six, Vector
+from tactile_resonance.contact.vectors import Six
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
 from tactile_resonance.fields import (
     FileName,
@@ -33,17 +33,6 @@ from tactile_resonance.fields import (
 
 LONGEST_S = 1.0
 """Of delays: with more, no contact is controlled."""
-
-
-@dataclass(frozen=True)
-class _Frame:
-    position_m: Vector
-    rotation_rad: Vector
-
-
-def _read_frame(value: object, where: str) -> Pose:
-    frame = read(_Frame, value, where)
-    return Pose(np.array(frame.position_m), np.array(frame.rotation_rad))
 
 
 def _read_bus(value: object, where: str) -> dict[str, Any]:
@@ -92,7 +81,7 @@ class ForceConfig:
     range_n: float
     range_nm: float
     mount: Mount
-    frame: Annotated[Pose, _read_frame]
+    frame: Pose
     name: str = ""
     latency_s: float = 0.0
     payload: Payload | None = None
