@@ -12,6 +12,7 @@ from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.interfaces import ForceInfo
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.vectors import rotated
+from tactile_resonance.fields import require
 
 FORCE_SHARE = 2 / 3
 """Of the abort force that may be asked for."""
@@ -34,26 +35,19 @@ def check_goal(
         Its housing must stay clear of the surface as deep as the limits allow, the tip as far off its
         orientation as they allow.
     """
-    if not np.isfinite(goal.touch.vector).all():
-        raise ValueError(f"touch: got {goal.touch.vector}; accepted are finite numbers")
+    good = bool(np.isfinite(goal.touch.vector).all())
+    require(good, "touch", goal.touch.vector.tolist(), "six finite numbers")
     most = FORCE_SHARE * limits.abort_force_n
-    if goal.aim.force_n > most * (1 + 1e-9):  # two thirds are no round number
-        raise ValueError(
-            f"force_n: got {goal.aim.force_n}; accepted is up to {most:g}, two thirds of abort_force_n"
-        )
+    good = goal.aim.force_n <= most * (1 + 1e-9)  # two thirds are no round number
+    require(good, "force_n", goal.aim.force_n, f"up to {most:g}, two thirds of abort_force_n")
     if math.isfinite(goal.hold_s):
-        slow = goal.unload_speed_m_s
+        slow, fastest = goal.unload_speed_m_s, parameters.retract_speed_m_s
         unload_s = limits.depth_m / slow if slow > 0 else 0.0
-        if not 0 <= goal.hold_s <= limits.hold_s - unload_s:
-            raise ValueError(
-                f"hold_s: got {goal.hold_s:g}; accepted is up to {limits.hold_s - unload_s:g}, limits.hold_s "
-                f"less {unload_s:g} s to draw back"
-            )
-        if not 0 <= slow <= parameters.retract_speed_m_s:
-            raise ValueError(
-                f"unload_speed_m_s: got {slow:g}; accepted is up to {parameters.retract_speed_m_s:g}, "
-                "retract_speed_m_s"
-            )
+        most = limits.hold_s - unload_s
+        accepted = f"up to {most:g}, limits.hold_s less {unload_s:g} s to draw back"
+        require(0 <= goal.hold_s <= most, "hold_s", goal.hold_s, accepted)
+        accepted = f"up to {fastest:g}, retract_speed_m_s"
+        require(0 <= slow <= fastest, "unload_speed_m_s", slow, accepted)
     box, normal = limits.workspace, np.array(rotated(goal.touch.turn, (0.0, 0.0, 1.0)))
     for name, height in (
         ("standoff", parameters.standoff_m),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import build, read_file, require
+from tactile_resonance.fields import build, check_within, read_file, require
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,7 @@ def ranges_of(kind: Any) -> dict[str, Range]:
 
 def check_ranges(owner: Any) -> None:
     """Raise ``ValueError`` naming the first number of a dataclass that is out of its range."""
-    for name, accepted in ranges_of(owner).items():
-        value = getattr(owner, name)
-        good = accepted.low <= value <= accepted.high
-        require(good, name, value, f"{accepted.low:g} to {accepted.high:g}")
+    check_within(owner, **{name: (of.low, of.high) for name, of in ranges_of(owner).items()})
 
 
 EARLY_SHARE = 0.8

@@ -137,11 +137,8 @@ def identify_payload(
     gravity = np.einsum("nji,j->ni", rotations, GRAVITY_M_S2)  # (n, 3) in the cell's frame
     equations = np.zeros((n, 6, 10))
     equations[:, :3, 0] = gravity
-    # (m c) x g = -[g]x (m c)
-    x, y, z = gravity.T
-    zero = np.zeros(n)
-    skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])  # (3, 3, n)
-    equations[:, 3:, 1:4] = -np.moveaxis(skew, -1, 0)
+    # (m c) x g, for each part of m c a column
+    equations[:, 3:, 1:4] = np.cross(np.eye(3), gravity[:, None]).swapaxes(1, 2)
     equations[:, :, 4:] = np.eye(6)
     a = (equations / sigma[..., None]).reshape(6 * n, 10)
     b = (wrenches / sigma).ravel()

@@ -75,8 +75,8 @@ def test_the_way_into_the_tissue_is_no_faster_than_asked_for():
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
-        ({"hold_s": 1e3}, "hold_s: got 1000; accepted is up to 120"),
-        ({"hold_s": 119.0, "unload_speed_m_s": 1e-3}, "hold_s: got 119; accepted is up to 117"),
+        ({"hold_s": 1e3}, "hold_s: got 1000.0; accepted is up to 120"),
+        ({"hold_s": 119.0, "unload_speed_m_s": 1e-3}, "hold_s: got 119.0; accepted is up to 117"),
         ({"hold_s": 1.0, "unload_speed_m_s": 0.5}, "unload_speed_m_s: got 0.5; accepted is up to"),
         ({"hold_s": 1.0, "press_speed_m_s": 1e-5}, "approach_speed_m_s"),
     ],

@@ -74,7 +74,7 @@ def test_a_relaxation_is_carried_out_and_gives_the_modulus_of_the_tissue(bench, 
 
 def test_what_lies_beyond_the_limits_is_refused_in_one_line(bench, client):
     for goal, words in (
-        (asked(Indentation.RELAXATION, 1e4), "hold_s: got 10000; accepted is up to 120"),
+        (asked(Indentation.RELAXATION, 1e4), "hold_s: got 10000.0; accepted is up to 120"),
         (asked(Indentation.INDENTATION, 0.0), "unload_speed_m_s: 0, accepted with INDENTATION"),
         (asked(9, 1.0), "protocol: 9, accepted are"),
     ):
