@@ -45,7 +45,7 @@ def test_the_cell_is_read(tmp_path, monkeypatch, capsys):
     pytest.importorskip("can", reason="python-can is not installed")
     monkeypatch.chdir(tmp_path)
     # on a busy machine the simulated cell sends less than it states, which the driver says rightly
-    monkeypatch.setattr("tactile_resonance.drivers.can_bus.Flow.short", lambda *_: False)
+    monkeypatch.setattr("tactile_resonance.drivers.can_bus.Flow.short", lambda *_: None)
     command = [sys.executable, "-m", "tactile_resonance.cli", "simulate-cell"]
     cell = subprocess.Popen(
         [*command, "--host", HOST, "--port", "0"],

@@ -82,8 +82,8 @@ RANGE_FACTOR = 5.0
 """Range, per force asked for: the hard stop of contact control must be measurable."""
 
 
-def unfit(info: ForceInfo, force_n: float) -> list[str]:
-    """What keeps a source from serving a force, one sentence each with its figures.
+def require_fit(info: ForceInfo, force_n: float) -> None:
+    """Refuse a source that cannot serve a force.
 
     The limits are those with which the contact controller was simulated: with three times the noise the
     95 % quantile of its overshoot goes from 10 to 33 % (docs/force_sensors.md).
@@ -93,42 +93,38 @@ def unfit(info: ForceInfo, force_n: float) -> list[str]:
     info : ForceInfo
     force_n : float
         Contact force asked for [N].
-    """
-    if not 0 < force_n < float("inf"):
-        raise ValueError(f"force_n: {force_n!r}, expected a force above 0")
-    noise_n = info.noise_rms_n * (REFERENCE_RATE_HZ / info.rate_hz) ** 0.5
-    most_noise_n, most_step_n = NOISE_SHARE * force_n, RESOLUTION_SHARE * force_n
-    slack = 1 + 1e-9
-    reasons = []
-    if not noise_n <= most_noise_n * slack:
-        reasons.append(
-            f"its noise is {noise_n * 1e3:.3g} mN rms (at {REFERENCE_RATE_HZ:g} Hz), at most "
-            f"{most_noise_n * 1e3:.3g} mN serve"
-        )
-    if not info.resolution_n <= most_step_n * slack:
-        reasons.append(
-            f"its smallest step is {info.resolution_n * 1e3:.3g} mN, at most "
-            f"{most_step_n * 1e3:.3g} mN serve"
-        )
-    if not info.rate_hz >= SLOWEST_HZ:
-        reasons.append(f"it gives {info.rate_hz:g} Hz, at least {SLOWEST_HZ:g} Hz serve")
-    if not info.range_n >= RANGE_FACTOR * force_n:
-        reasons.append(
-            f"its range is {info.range_n * 1e3:.4g} mN, at least {RANGE_FACTOR * force_n * 1e3:.3g} mN serve"
-        )
-    return reasons
-
-
-def require_fit(info: ForceInfo, force_n: float) -> None:
-    """Refuse a source that cannot serve a force.
 
     Raises
     ------
     ValueError
         With every reason and its figures.
     """
-    reasons = unfit(info, force_n)
+    if not 0 < force_n < float("inf"):
+        raise ValueError(f"force_n: {force_n!r}, expected a force above 0")
+    noise_n = info.noise_rms_n * (REFERENCE_RATE_HZ / info.rate_hz) ** 0.5
+    most_noise_n, most_step_n = NOISE_SHARE * force_n, RESOLUTION_SHARE * force_n
+    slack = 1 + 1e-9
+    judged = (
+        (
+            noise_n <= most_noise_n * slack,
+            f"its noise is {noise_n * 1e3:.3g} mN rms (at {REFERENCE_RATE_HZ:g} Hz), at most "
+            f"{most_noise_n * 1e3:.3g} mN serve",
+        ),
+        (
+            info.resolution_n <= most_step_n * slack,
+            f"its smallest step is {info.resolution_n * 1e3:.3g} mN, at most "
+            f"{most_step_n * 1e3:.3g} mN serve",
+        ),
+        (
+            info.rate_hz >= SLOWEST_HZ,
+            f"it gives {info.rate_hz:g} Hz, at least {SLOWEST_HZ:g} Hz serve",
+        ),
+        (
+            info.range_n >= RANGE_FACTOR * force_n,
+            f"its range is {info.range_n * 1e3:.4g} mN, at least "
+            f"{RANGE_FACTOR * force_n * 1e3:.3g} mN serve",
+        ),
+    )
+    reasons = "; ".join(text for good, text in judged if not good)
     if reasons:
-        raise ValueError(
-            f"force source {info.name} cannot control {force_n * 1e3:.3g} mN: {'; '.join(reasons)}"
-        )
+        raise ValueError(f"force source {info.name} cannot control {force_n * 1e3:.3g} mN: {reasons}")

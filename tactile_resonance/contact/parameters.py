@@ -276,15 +276,12 @@ class Limits:
         ValueError
             If one would be raised.
         """
-        for name, value in (("abort_force_n", abort_force_n), ("depth_m", depth_m)):
+        asked: dict[str, Any] = {"abort_force_n": abort_force_n, "depth_m": depth_m}
+        lower = {name: value for name, value in asked.items() if value is not None}
+        for name, value in lower.items():
             limit = getattr(self, name)
-            good = value is None or 0 < value <= limit
-            require(good, name, value, f"above 0, at most the limit {limit:g}")
-        return replace(
-            self,
-            abort_force_n=self.abort_force_n if abort_force_n is None else abort_force_n,
-            depth_m=self.depth_m if depth_m is None else depth_m,
-        )
+            require(0 < value <= limit, name, value, f"above 0, at most the limit {limit:g}")
+        return replace(self, **lower)
 
     def lost_below_n(self, force_n: float) -> float:
         """Mean force [N] below which a contact that is to press with `force_n` is lost."""

@@ -300,25 +300,18 @@ def _opened(settings: dict[str, Any]) -> can.BusABC:
 
 
 class Flow:
-    """Whether as many wrenches arrive as the cell sends.
-
-    Attributes
-    ----------
-    rate_hz : float
-        Of the last window.
-    """
+    """Whether as many wrenches arrive as the cell sends."""
 
     def __init__(self, nominal_hz: float, now_s: float) -> None:
         self._nominal_hz = nominal_hz
         self._begin_s, self._count, self._short = now_s, 0, 0
-        self.rate_hz = nominal_hz
 
-    def short(self, now_s: float, count: int) -> bool:
-        """Whether two windows on end were short; a reader held up in one catches up in the next."""
+    def short(self, now_s: float, count: int) -> float | None:
+        """Rate [Hz] where two windows on end were short: a reader held up in one catches up in the next."""
         span_s = now_s - self._begin_s
         if span_s < RATE_WINDOW_S:
-            return False
-        self.rate_hz = (count - self._count) / span_s
+            return None
+        rate_hz = (count - self._count) / span_s
         self._begin_s, self._count = now_s, count
-        self._short = self._short + 1 if self.rate_hz < LEAST_SHARE * self._nominal_hz else 0
-        return self._short > 1
+        self._short = self._short + 1 if rate_hz < LEAST_SHARE * self._nominal_hz else 0
+        return rate_hz if self._short > 1 else None

@@ -276,8 +276,9 @@ class CanWrench:
                 raise self._silence(bus, now_s - self._last_s)
             self._last_s, self._excused = now_s, True
         streams = self._config.description.commands.request is None
-        if streams and self._flow.short(now_s, self.received + self.lost):
-            text = f"{self._flow.rate_hz:.0f} wrenches/s of {self._config.info.rate_hz:.0f} arrive"
+        short_hz = self._flow.short(now_s, self.received + self.lost) if streams else None
+        if short_hz is not None:
+            text = f"{short_hz:.0f} wrenches/s of {self._config.info.rate_hz:.0f} arrive"
             raise ForceError(
                 ForceFault.INCOMPLETE, f"{self._where}: {text}: the interface is too slow"
             )

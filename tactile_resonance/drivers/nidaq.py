@@ -11,7 +11,7 @@ import importlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -107,13 +107,9 @@ class NiDaqDevice:
                 f"{reach_v:g} V"
             )
         self._rate_hz = sample_rate_hz
-        with translated("configure"):
-            task = self._make_input(samples=2)
-            try:
-                task.control(self._constants.TaskMode.TASK_VERIFY)
-                real_hz = float(task.timing.samp_clk_rate)
-            finally:
-                task.close()
+        with translated("configure"), closing(self._make_input(samples=2)) as task:
+            task.control(self._constants.TaskMode.TASK_VERIFY)
+            real_hz = float(task.timing.samp_clk_rate)
         if abs(real_hz - sample_rate_hz) > _RATE_TOLERANCE * sample_rate_hz:
             raise DeviceError(
                 f"nidaqmx: sample_rate_hz: {sample_rate_hz:.9g}, the device would sample at "
@@ -300,12 +296,9 @@ class NiDaqDevice:
 
     def _zero(self) -> list[str]:
         def write_zero() -> None:
-            task = self._daq.Task()
-            try:
+            with closing(self._daq.Task()) as task:
                 self._add_output(task)
                 task.write(0.0, auto_start=True)
-            finally:
-                task.close()
 
         errors = attempt("zero", write_zero)
         return [f"THE OUTPUT MAY NOT BE AT ZERO: {error}" for error in errors]

@@ -3,7 +3,7 @@
 
 import pytest
 
-from tactile_resonance.contact.admission import require_fit, unfit
+from tactile_resonance.contact.admission import require_fit
 from tactile_resonance.contact.interfaces import ForceInfo, Mount
 
 
@@ -17,22 +17,23 @@ def test_the_required_cell_serves_1_cn_and_those_in_the_page_do_not():
     ):
         require_fit(robotous, 0.01)
     e_series = ForceInfo("UR e-series", 500.0, 4.0, 0.1, 100.0, Mount.TOOL)
-    assert len(unfit(e_series, 0.01)) == 2
-    assert not unfit(robotous, 2.0)
+    with pytest.raises(ValueError, match="its noise is [^;]*; its smallest step is [^;]*$"):
+        require_fit(e_series, 0.01)
+    require_fit(robotous, 2.0)
 
 
 def test_noise_is_compared_by_its_density():
     fast = ForceInfo("fast", 2000.0, 2e-3, 1e-4, 1.0, Mount.TABLE)
     slow = ForceInfo("slow", 250.0, 0.8e-3, 1e-4, 1.0, Mount.TABLE)
-    assert not unfit(fast, 0.01)
-    assert "1.13 mN rms" in unfit(slow, 0.01)[0]
+    require_fit(fast, 0.01)
+    with pytest.raises(ValueError, match=r"1\.13 mN rms"):
+        require_fit(slow, 0.01)
 
 
 def test_rate_and_range_are_asked_for_too():
     poor = ForceInfo("poor", 100.0, 1e-5, 1e-5, 0.02, Mount.TABLE)
-    assert unfit(poor, 0.01) == [
-        "it gives 100 Hz, at least 200 Hz serve",
-        "its range is 20 mN, at least 50 mN serve",
-    ]
+    reasons = "it gives 100 Hz, at least 200 Hz serve; its range is 20 mN, at least 50 mN serve"
+    with pytest.raises(ValueError, match=f"^force source poor cannot control 10 mN: {reasons}$"):
+        require_fit(poor, 0.01)
     with pytest.raises(ValueError, match="force_n: 0"):
-        unfit(poor, 0)
+        require_fit(poor, 0)
