@@ -187,8 +187,6 @@ class UrArm:
 
     def close(self) -> None:
         """Stop the arm and its program and end the client; never raises."""
-        if self.client is not None:
-            self.client.end()
         self._forget()
         if self.led is not None:
             self.led.close()
@@ -223,11 +221,9 @@ class UrArm:
             select.select([states.stream], [], [], 0.1)
             self.receive(now_known=True)
 
-    def date_anew(self) -> bool:
-        """Date the newest state, of an unknown time, now; whether there is one."""
-        if self._states is not None:
-            self._states.date_anew()
-        return self._states is not None
+    def date_anew(self) -> None:
+        """Date the newest state, of an unknown time, now."""
+        self._reader.date_anew()
 
     # helpers
 
@@ -240,12 +236,9 @@ class UrArm:
 
     def _connect_again(self) -> bool:
         """Start the program again over a good connection; False where everything must be reconnected."""
-        assert self.client is not None
         try:
             self._fresh()
         except ArmError:
-            if self.client is not None:  # else `_fresh` has ended it
-                self.client.end()
             self._forget()
             return False
         if self._reader.fault is None:
@@ -344,8 +337,6 @@ class UrArm:
                 if states.read(now_known or self.led is None):
                     self.heard_s = time.monotonic()
         except ConnectionError as error:
-            if self.client is not None:
-                self.client.end()
             self._forget()
             text = f"the connection to {self.config.host} is lost"
             raise ArmError(ArmFault.LINK_LOST, text) from error
@@ -365,7 +356,6 @@ class UrArm:
             seen |= FAULTY | REVIVED if states.revived else FAULTY
         client.look(seen)
         if age_s > GIVE_UP_S:
-            client.end()
             self._forget()
             raise ArmError(ArmFault.LINK_LOST, f"the connection to {config.host} is lost")
         if age_s > config.max_state_age_s:
@@ -403,7 +393,9 @@ class UrArm:
             self.client.exchange.beat()
 
     def _forget(self) -> None:
-        """Nothing is connected any more."""
+        """End the client; nothing is connected any more."""
+        if self.client is not None:
+            self.client.end()
         states, self.client, self._states = self._states, None, None
         if states is not None:
             states.stream.close()

@@ -12,8 +12,7 @@ import time
 from typing import NamedTuple
 
 SIZE = mmap.PAGESIZE
-_VALUE, _PAIR = struct.Struct("<q"), struct.Struct("<qq")
-_BEAT, _SEEN, _DONE, _REFUSED, _HEARD = 0, 8, 16, 24, 32
+_BEAT, _SEEN, _DONE, _REFUSED, _HEARD = range(5)
 
 SPEED, STOP, NOTHING = b"s", b"t", b"-"
 _COMMAND = struct.Struct("<cxxxxxxxqqq7d")
@@ -73,6 +72,7 @@ class Exchange:
 
     def __init__(self, descriptor: int) -> None:
         self._page = mmap.mmap(descriptor, SIZE)
+        self._values = memoryview(self._page).cast("q")
         self._reported = 0
 
     def beat(self, seen: int | None = None) -> int:
@@ -80,50 +80,42 @@ class Exchange:
 
         Returns when, by this machine's monotonic clock [ns].
         """
-        now_ns = time.monotonic_ns()
-        if seen is None:
-            self._write(_BEAT, now_ns)
-        else:
-            _PAIR.pack_into(self._page, _BEAT, now_ns, seen)
+        self._values[_BEAT] = now_ns = time.monotonic_ns()
+        if seen is not None:
+            self._values[_SEEN] = seen
         return now_ns
 
     def silence_s(self) -> float:
         """Client: time since the owner's last sign of life [s]."""
-        return (time.monotonic_ns() - self._read(_BEAT)) * 1e-9
+        return (time.monotonic_ns() - self._values[_BEAT]) * 1e-9
 
     @property
     def seen(self) -> int:
         """Client: what the owner sees of the robot."""
-        return self._read(_SEEN)
+        return self._values[_SEEN]
 
     def report(self, number: int, done: bool) -> None:
         """Client: report that a command was done, or refused."""
         if not done:
-            self._write(_REFUSED, number)
+            self._values[_REFUSED] = number
         self._reported = max(number, self._reported)
-        self._write(_DONE, self._reported)
+        self._values[_DONE] = self._reported
 
     @property
     def answered(self) -> tuple[int, int]:
         """Owner: numbers of the last command that was done or refused, and of the last refused; 0: none."""
-        done, refused = _PAIR.unpack_from(self._page, _DONE)
-        return done, refused
+        return self._values[_DONE], self._values[_REFUSED]
 
     def hear(self, until_ns: int) -> None:
         """Client: state the time up to which it has let simulated time go on for the owner."""
-        self._write(_HEARD, until_ns)
+        self._values[_HEARD] = until_ns
 
     @property
     def heard_ns(self) -> int:
         """Owner: the time that the client has let go on to last."""
-        return self._read(_HEARD)
+        return self._values[_HEARD]
 
     def close(self) -> None:
         """Unmap."""
+        self._values.release()
         self._page.close()
-
-    def _write(self, at: int, value: int) -> None:
-        _VALUE.pack_into(self._page, at, value)
-
-    def _read(self, at: int) -> int:
-        return _VALUE.unpack_from(self._page, at)[0]

@@ -162,7 +162,8 @@ class LedClock(OfRosTime):
                 self.bench.ask_ns()  # times received while it connected are of the past
             self._arm.catch_up(self.bench.robot_ns)
             if not self.dated:
-                self.dated = self._arm.date_anew()
+                self._arm.date_anew()
+                self.dated = True
         except ArmError:  # reported by `state`
             self._look_again()
 

@@ -77,7 +77,7 @@ def test_sign_of_life_ages_until_the_next(exchanges):
     owner.beat()
     first = client.silence_s()
     assert 0 <= first <= client.silence_s()
-    owner._write(0, 0)  # as if given when this machine began
+    owner._values[0] = 0  # as if given when this machine began
     assert client.silence_s() > 0.01
     owner.beat(FRESH)
     assert client.silence_s() < first + 60.0
