@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,32 +87,28 @@ class ReplayDevice:
                 raise DeviceError(f"replay: the recording is over: {self._path} was played")
             self._next_after = 1
             self._measurement = self._file
-            named: dict[str, Any] = {
-                "measurement_id": asked.measurement_id,
-                "label": asked.label or self._path.name,
-                "bands": asked.bands,
-            }
-            return [replace(excitation, **named) for excitation in self._file.excitations]
+            label = asked.label or self._path.name
+            return [
+                replace(e, measurement_id=asked.measurement_id, label=label, bands=asked.bands)
+                for e in self._file.excitations
+            ]
         self._measurement = self._find(asked)
         last = self._measurement.records[-1]
         recorded = {e.realisation: e for e in self._measurement.excitations}
-        planned = []
-        for realisation in range(last.realisation + 1):
+        realisations = range(last.realisation + 1)
+        for realisation in realisations:
             if realisation not in recorded:
                 raise DeviceError(
                     f"replay: measurement {self._measurement.measurement_id}: the excitation of "
                     f"realisation {realisation + 1} is not readable {list(self._measurement.problems)}"
                 )
-            excitation = recorded[realisation]
-            is_last = realisation == last.realisation
-            periods = last.block_index + 1 if is_last else excitation.periods
-            bands = excitation.bands or asked.bands
-            planned.append(
-                replace(
-                    excitation, periods=periods, realisations=last.realisation + 1, bands=bands
-                )
-            )
-        return planned
+        recorded[last.realisation] = replace(
+            recorded[last.realisation], periods=last.block_index + 1
+        )
+        return [
+            replace(e, realisations=len(realisations), bands=e.bands or asked.bands)
+            for e in (recorded[realisation] for realisation in realisations)
+        ]
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
         """What the recording says of its device."""
@@ -206,27 +201,27 @@ class ReplayDevice:
 
     def _find(self, asked: Excitation) -> StoredMeasurement:
         """The one named, or the next that holds a record and was driven, or silent, as is asked for."""
-        measurement_id = asked.measurement_id
+        measurement_id, silent = asked.measurement_id, asked.level_v == 0
         if measurement_id:
-            for entry in self._entries:
-                if entry.measurement_id == measurement_id:
-                    # out of turn: the turn of the others stays what it is
-                    self._next_after = self._next
-                    measurement = entry.read()
-                    if measurement.records and _is_silent(measurement) != (asked.level_v == 0):
-                        raise DeviceError(
-                            f"replay: measurement {measurement_id} is silent, or the goal is: one of them"
-                        )
-                    if measurement.records:
-                        return measurement
-                    raise DeviceError(
-                        f"replay: measurement {measurement_id} holds no readable record "
-                        f"{list(measurement.problems)}"
-                    )
-            raise DeviceError(f"replay: no measurement {measurement_id} in {self._path}")
+            named = [entry for entry in self._entries if entry.measurement_id == measurement_id]
+            if not named:
+                raise DeviceError(f"replay: no measurement {measurement_id} in {self._path}")
+            # out of turn: the turn of the others stays what it is
+            self._next_after = self._next
+            measurement = named[0].read()
+            if not measurement.records:
+                raise DeviceError(
+                    f"replay: measurement {measurement_id} holds no readable record "
+                    f"{list(measurement.problems)}"
+                )
+            if _is_silent(measurement) != silent:
+                raise DeviceError(
+                    f"replay: measurement {measurement_id} is silent, or the goal is: one of them"
+                )
+            return measurement
         for position in range(self._next, len(self._entries)):
             measurement = self._entries[position].read()
-            if measurement.records and _is_silent(measurement) == (asked.level_v == 0):
+            if measurement.records and _is_silent(measurement) == silent:
                 self._next_after = position + 1
                 return measurement
         raise DeviceError(
