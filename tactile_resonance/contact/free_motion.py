@@ -88,11 +88,8 @@ class FreeMotion:
         p, path = self._parameters, self._path
         lift_m = max(0.0, p.standoff_m - path.height_m(arm))
         lifted_m = added(arm.position_m, scaled(lift_m, path.normal))
-        turns_m = (
-            []
-            if self._turning is None
-            else [vector(pose.position_m) for pose in self._turning.poses]
-        )
+        poses = () if self._turning is None else self._turning.poses
+        turns_m = [vector(pose.position_m) for pose in poses]
         deepest_m = path.place_at(-p.search_m - self._limits.depth_m)
         return [arm.position_m, lifted_m, *turns_m, path.place_at(p.standoff_m), deepest_m]
 

@@ -31,9 +31,10 @@ class ArmModel:
         Of the tip, as far as the model knows.
     """
 
-    def __init__(self, *, dead_time_s: float, lag_s: float, period_s: float) -> None:
-        self._period_s, self._lag_s = period_s, lag_s
-        self._line: deque[float] = deque([0.0] * max(1, round(dead_time_s / period_s)))
+    def __init__(self, parameters: ContactParameters) -> None:
+        self._period_s = period_s = parameters.period_s
+        self._lag_s = lag_s = parameters.arm_lag_s
+        self._line: deque[float] = deque([0.0] * max(1, round(parameters.arm_dead_time_s / period_s)))
         self._keep = math.exp(-period_s / lag_s) if lag_s > 0 else 0.0
         self.set_speed_m_s = 0.0
         self.speed_m_s = 0.0
@@ -79,8 +80,8 @@ class Observer:
     arm_model : ArmModel
     model : ContactFilter or None
         From the touch on.
-    taring, tared : bool
-        Whether forces are collected for a tare; whether there is a zero.
+    taring : bool
+        Whether forces are collected for a tare.
     sound : bool
         Whether no force of this contact was bad.
     touched_m : float or None
@@ -95,12 +96,10 @@ class Observer:
         p = self.parameters = parameters
         self.limits = limits
         self.watch = ForceWatch(limits.stuck_samples, limits.lost_s)
-        self.arm_model = ArmModel(
-            dead_time_s=p.arm_dead_time_s, lag_s=p.arm_lag_s, period_s=p.period_s
-        )
+        self.arm_model = ArmModel(p)
         self.model: ContactFilter | None = None
         self.taring = False
-        self.tared, self.sound = False, True
+        self.sound = True
         self.touched_m: float | None = None
         self._unloaded: list[WrenchSample] = []
         self.zero: Zero | None = None
@@ -149,7 +148,6 @@ class Observer:
             return Breach(Cause.TARE, "tare: the zero is not known from the contact before")
         self.zero = zero
         self.watch.set_bias(vector(zero.force_n))
-        self.tared = True
         self.noise_n = max(LEAST_NOISE_N, noise)
         self.bias_std_n = float(zero.std_n[2])
         # neighbouring forces that are alike make means less certain than white noise would

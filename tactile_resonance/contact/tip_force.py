@@ -52,14 +52,9 @@ class Mounting:
             )
 
     @cached_property
-    def _place_m(self) -> Vector:
-        """Of the cell in what it sits on."""
-        return vector(self.frame.position_m)
-
-    @cached_property
-    def _turn(self) -> Turn:
-        """Rotation of the cell in what it sits on."""
-        return turn_from_vector(vector(self.frame.rotation_rad))
+    def _seat(self) -> tuple[Vector, Turn]:
+        """Place and rotation of the cell in what it sits on."""
+        return vector(self.frame.position_m), self.frame.turn
 
     def to_tip(
         self, samples: Iterable[CellSample], tip_m: Vector, tip_turn: Turn
@@ -76,14 +71,15 @@ class Mounting:
             Place and orientation of the frame `tip` in the base while they were measured.
         """
         cfx = cfy = cfz = ctx = cty = ctz = 0.0  # what the cell carries
+        place, seat_turn = self._seat
         if self.mount is Mount.TOOL:
-            turn, lever = self._turn, self._place_m
+            turn, lever = seat_turn, place
             if self.payload is not None:
                 cfx, cfy, cfz, ctx, cty, ctz = self.payload.wrench(turn_product(tip_turn, turn))
         else:
             back = transposed(tip_turn)
-            turn = back if self._turn == NO_TURN else turn_product(back, self._turn)
-            lever = rotated(back, difference(self._place_m, tip_m))
+            turn = back if seat_turn == NO_TURN else turn_product(back, seat_turn)
+            lever = rotated(back, difference(place, tip_m))
         (a, b, c, d, e, f, g, h, i), (lx, ly, lz) = turn, lever
         if self.mount is Mount.TABLE:  # what acts on the sample, turned round
             a, b, c, d, e, f, g, h, i = -a, -b, -c, -d, -e, -f, -g, -h, -i

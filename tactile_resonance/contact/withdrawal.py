@@ -97,7 +97,7 @@ class Withdrawal:
         model, touched_m = self._observer.model, self._observer.touched_m
         if model is not None and touched_n > 0:
             self._n_per_m, _ = model.slope_at(model.depth_for(touched_n))
-        if self._least_n is None and self._observer.tared:
+        if self._least_n is None and self._observer.zero is not None:
             if model is not None and touched_m is not None:
                 self._surface_m = max(model.surface_m, touched_m)
             # the force goes down by what is pressed with, wherever the zero is now
@@ -174,13 +174,14 @@ class Withdrawal:
     def _leave(self, arm: ArmSample, height_m: float, force_n: float) -> Move:
         """At the standoff: idle where nothing presses or pulls, else on until it no longer changes."""
         observer = self._observer
+        tared = observer.zero is not None
         if self._step is None:
             mean_n = observer.watch.mean_n
             samples = max(1.0, self._limits.lost_s / self._parameters.period_s)
             left_n = max(LEFT_N, NOISES * observer.noise_n / math.sqrt(samples))
-            small = observer.tared and mean_n is not None and abs(mean_n) <= left_n
-            if small or not (observer.tared or self._must_leave):
-                self.zero_n = mean_n if observer.tared else None
+            small = tared and mean_n is not None and abs(mean_n) <= left_n
+            if small or not (tared or self._must_leave):
+                self.zero_n = mean_n if tared else None
                 return Move(None, State.IDLE)
             self._step, self._before_n = (height_m, []), math.nan
             self._felt_s = 0.0
@@ -188,7 +189,7 @@ class Withdrawal:
         if self._felt_s <= FEEL_NOT_S:
             self._left_n = self._smooth_n
         # what still presses goes as the tip rises
-        if observer.tared and self._smooth_n < min(self._left_n, 0.0) - self._grown_n():
+        if tared and self._smooth_n < min(self._left_n, 0.0) - self._grown_n():
             return self._held(height_m)
         begun_m, forces_n = self._step
         forces_n.append(force_n)
@@ -200,11 +201,11 @@ class Withdrawal:
                     Cause.HELD, f"{1e3 * now_n:.1f} mN at the standoff, and no room above it"
                 )
             if change_n < max(LEFT_N / 2, NOISES * std_n * math.sqrt(2 / len(forces_n))):
-                self.zero_n = now_n if observer.tared else None
+                self.zero_n = now_n if tared else None
                 return Move(None, State.IDLE)
             self._step, self._before_n = (height_m, []), now_n
         if height_m - self._free.clear_m > BEYOND_M:
-            if not observer.tared:  # a source that is not steady enough for a zero says no more
+            if not tared:  # a source that is not steady enough for a zero says no more
                 return Move(None, State.IDLE)
             text = f"the force still changes {1e3 * height_m:.0f} mm above the surface"
             return failed(Cause.HELD, f"{text}: free the tip, then ask it to retract")

@@ -253,7 +253,7 @@ def test_way_still_to_come_is_what_the_arm_then_goes():
     # the model against the simulated arm, told a profile and then to stand still
     parameters = TrackingParameters(jitter_rms_m=0.0)
     tip = TipMotion(parameters, Pose(np.zeros(3), np.zeros(3)))
-    model = ArmModel(dead_time_s=0.004, lag_s=0.010, period_s=DT)
+    model = ArmModel(ContactParameters(arm_dead_time_s=0.004, arm_lag_s=0.010, period_s=DT))
     for n in range(200):
         speed = 4e-3 * math.sin(0.05 * n)
         tip.speed(np.array([0, 0, speed, 0, 0, 0]), 0.5)
