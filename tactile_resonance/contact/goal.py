@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from tactile_resonance.contact.estimator import ContactEstimate
 from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import Pose
@@ -93,14 +92,11 @@ class Move(NamedTuple):
         That follows; None: the same.
     breach : Breach or None
         Why `to` is `State.FAULT`.
-    estimate : ContactEstimate or None
-        With which the force was reached, where `to` is `State.HOLD`.
     """
 
     twist: Six | None
     to: State | None = None
     breach: Breach | None = None
-    estimate: ContactEstimate | None = None
 
 
 REST = Move(None)

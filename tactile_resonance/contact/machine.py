@@ -379,9 +379,10 @@ class ContactController:
         elif move.to is not None:
             if move.to is State.RETRACT and self.state is State.HOLD:
                 self._end(Breach(Cause.HOLD_ENDED, f"held for {goal.hold_s:g} s as asked"), now_ns)
-            if move.estimate is not None:
+            estimate = self.estimate
+            if move.to is State.HOLD and estimate is not None:
                 told_m = self._free.told_m
-                self._outcome.reached(now_ns, self._pressing.touched_ns, move.estimate, told_m)
+                self._outcome.reached(now_ns, self._pressing.touched_ns, estimate, told_m)
             if move.to is State.IDLE and not self._rising:
                 observer = self._observer
                 # the second zero is a mean over as long as a lost contact is

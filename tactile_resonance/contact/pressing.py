@@ -187,8 +187,7 @@ class Pressing:
             slope, _ = model.slope_at(model.depth_for(self._aim.force_n))
             deepest = min(deepest, self._limits.abort_force_n / 2 / (slope * REACTION_S))
         twist = self._path.along_normal(arm, min(most, max(-deepest, speed)))
-        reached = model.estimate(place.height_m) if to is State.HOLD else None
-        return Move(twist, to, estimate=reached)
+        return Move(twist, to)
 
     def _unload(self, over_s: float, arm: ArmSample, place: Place) -> Move:
         """After the hold that was asked for: draw back, at an even speed where one is asked for."""
