@@ -23,7 +23,7 @@ from tactile_resonance.drivers.nidaq_config import TERMINALS, InputChannel, NiDa
 from tactile_resonance.drivers.nidaq_scale import CountScale
 from tactile_resonance.fields import one_line
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.record import Channel
+from tactile_resonance.record import Channel, InputKind
 
 _RATE_TOLERANCE = 1e-9
 
@@ -118,7 +118,7 @@ class NiDaqDevice:
         return DeviceInfo(
             name=", ".join(names),
             simulated=False,
-            input_kind=config.input_kind,
+            input_kind=InputKind.MEASURED if config.actuator else InputKind.COMMANDED,
             between_samples=config.between_samples,
             output_peak_v=config.output.max_voltage_v,
             channel_delay_s=config.channel_delay_s,
@@ -258,7 +258,8 @@ class NiDaqDevice:
 
     def _make_output(self, period: FloatArray) -> Any:
         """The period, repeated on the inputs' clock from the inputs' start on."""
-        clock = f"/{self._config.clock}/ai"
+        device = self._config.clock_device or self._config.sensor.channel.split("/")[0]
+        clock = f"/{device}/ai"
         task = self._daq.Task()
         try:
             self._add_output(task)

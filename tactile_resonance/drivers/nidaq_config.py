@@ -103,16 +103,6 @@ class NiDaqConfig:
         check_above_zero(self, "buffer_s")
 
     @property
-    def input_kind(self) -> InputKind:
-        """How the actuator channel is obtained."""
-        return InputKind.MEASURED if self.actuator else InputKind.COMMANDED
-
-    @property
     def inputs(self) -> list[InputChannel]:
         """In the order in which they are read: actuator, where it is measured, then sensor."""
         return [self.actuator, self.sensor] if self.actuator else [self.sensor]
-
-    @property
-    def clock(self) -> str:
-        """Device whose sample clock and start trigger all use."""
-        return self.clock_device or self.sensor.channel.split("/")[0]
