@@ -12,28 +12,20 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import build, check_within, read_file, require
 
 
-@dataclass(frozen=True)
-class Range:
-    """What a number may be, ends included, and what it is."""
-
-    low: float
-    high: float
-    description: str
-
-
 def within(default: float, low: float, high: float, description: str) -> Any:
     """Field of a dataclass with a default, a range and a description, in SI units."""
-    return field(default=default, metadata={Range: Range(low, high, description)})
+    return field(default=default, metadata={"range": (low, high, description)})
 
 
-def ranges_of(kind: Any) -> dict[str, Range]:
-    """Range of each field that was made by `within`, of a dataclass or one of its objects."""
-    return {each.name: each.metadata[Range] for each in fields(kind) if Range in each.metadata}
+def ranges_of(kind: Any) -> dict[str, tuple[float, float, str]]:
+    """Range and description of each field that was made by `within`, of a dataclass or one of its objects."""
+    return {each.name: each.metadata["range"] for each in fields(kind) if "range" in each.metadata}
 
 
 def check_ranges(owner: Any) -> None:
     """Raise ``ValueError`` naming the first number of a dataclass that is out of its range."""
-    check_within(owner, **{name: (of.low, of.high) for name, of in ranges_of(owner).items()})
+    ranges = ranges_of(owner).items()
+    check_within(owner, **{name: (low, high) for name, (low, high, _) in ranges})
 
 
 EARLY_SHARE = 0.8

@@ -47,15 +47,10 @@ def contact_parameters() -> tuple[Parameter, ...]:
     """One parameter for each number and corner, the defaults from ``config/contact.yaml``."""
     made = []
     for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
-        for name, accepted in ranges_of(kind).items():
-            full = f"{group}.{name}"
-            limits = (accepted.low, accepted.high)
-            made.append(
-                Parameter(
-                    *(full, getattr(defaults, name), accepted.description, *limits),
-                    read_only=full in _READ_ONLY,
-                )
-            )
+        for name, (low, high, description) in ranges_of(kind).items():
+            full, default = f"{group}.{name}", getattr(defaults, name)
+            read_only = full in _READ_ONLY
+            made.append(Parameter(full, default, description, low, high, read_only=read_only))
     box = _defaults()[1].workspace
     corners = ((_LOW, box.low_m), (_HIGH, box.high_m))
     return (*made, *(Parameter(full, list(corner), _CORNERS) for full, corner in corners))

@@ -72,7 +72,7 @@ def test_a_limit_that_protects_the_tissue_is_made_stricter_and_never_laxer(launc
     node = launch()
     limit = node.get_parameter(full(name)).value
     short = name.removeprefix("contact.")
-    above = min((ranges_of(ContactParameters) | ranges_of(Limits))[short].high, 2 * limit)
+    above = min((ranges_of(ContactParameters) | ranges_of(Limits))[short][1], 2 * limit)
     below = limit - 1 if isinstance(limit, int) else 0.9 * limit
     if name in ("near_speed_m_s", "contact_speed_m_s"):
         below = limit  # the parameters ask for it
