@@ -12,8 +12,7 @@ about that normal.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
@@ -185,41 +184,32 @@ PASSED_M, PASSED_RAD = 5e-4, 1e-2
 """Nearer than this to a place or an orientation on the way, the tip goes on to the next."""
 
 
-@dataclass(frozen=True)
-class _Sweep:
-    """A turn of the tip about its ball.
+Sweep = tuple[Turn, Vector]
+"""A turn of the tip about its ball: orientation where it begins, rotation vector in the base [rad]."""
 
-    Attributes
-    ----------
-    first : Turn
-        Orientation where it begins.
-    rotation_rad : Vector
-        In the base.
+
+def _end_of(sweep: Sweep) -> Turn:
+    """Orientation where a turn ends."""
+    first, rotation_rad = sweep
+    return turn_product(turn_from_vector(rotation_rad), first)
+
+
+def _lowest(sweep: Sweep, normal: Vector, place_m: Vector) -> float:
+    """Least height along a normal of a place in the frame `tip`, seen from the ball's centre [m].
+
+    By Rodrigues' formula it is a sinusoid of the angle, whose trough is on the way or not.
     """
-
-    first: Turn
-    rotation_rad: Vector
-
-    @cached_property
-    def last(self) -> Turn:
-        """Orientation where it ends."""
-        return turn_product(turn_from_vector(self.rotation_rad), self.first)
-
-    def lowest(self, normal: Vector, place_m: Vector) -> float:
-        """Least height along a normal of a place in the frame `tip`, seen from the ball's centre [m].
-
-        By Rodrigues' formula it is a sinusoid of the angle, whose trough is on the way or not.
-        """
-        begun, angle = rotated(self.first, place_m), math.hypot(*self.rotation_rad)
-        if angle == 0.0:
-            return dot(normal, begun)
-        axis = scaled(1 / angle, self.rotation_rad)
-        still = dot(normal, axis) * dot(axis, begun)
-        cosine, sine = dot(normal, begun) - still, dot(normal, cross(axis, begun))
-        trough = math.atan2(-sine, -cosine) % (2 * math.pi)
-        if trough <= angle:
-            return still - math.hypot(cosine, sine)
-        return still + min(cosine, cosine * math.cos(angle) + sine * math.sin(angle))
+    first, rotation_rad = sweep
+    begun, angle = rotated(first, place_m), math.hypot(*rotation_rad)
+    if angle == 0.0:
+        return dot(normal, begun)
+    axis = scaled(1 / angle, rotation_rad)
+    still = dot(normal, axis) * dot(axis, begun)
+    cosine, sine = dot(normal, begun) - still, dot(normal, cross(axis, begun))
+    trough = math.atan2(-sine, -cosine) % (2 * math.pi)
+    if trough <= angle:
+        return still - math.hypot(cosine, sine)
+    return still + min(cosine, cosine * math.cos(angle) + sine * math.sin(angle))
 
 
 class TurningWay:
@@ -256,11 +246,10 @@ class TurningWay:
         goal, begun = path.goal, turn_from_vector(start.rotation_rad)
         self.departure = TipPath(replace(goal, touch=start.tip), path.tip)
         old, new = self.departure.normal, path.normal
-        swing = _Sweep(begun, _shortest(old, new))
-        spin = _Sweep(
-            swing.last,
-            vector_from_turn(turn_product(goal.touch.turn, transposed(swing.last))),
-        )
+        swing = begun, _shortest(old, new)
+        swung = _end_of(swing)
+        spin = swung, vector_from_turn(turn_product(goal.touch.turn, transposed(swung)))
+        spun = _end_of(spin)
         # the tip may have been left pressing, as deep as it may
         planes = ((self.departure, limits.depth_m), (path, parameters.early_m))
         up = added(old, new)
@@ -270,8 +259,7 @@ class TurningWay:
         rise_m = self._lacking(off_m, planes, (swing, spin)) / max(half, 1e-9)
         turn_at_m = added(off_m, scaled(rise_m, up))
         over_m = path.place_at(parameters.standoff_m)
-        held = _Sweep(spin.last, ZERO)
-        down_m = self._lacking(over_m, planes, (held,)) / max(half, 1e-9)
+        down_m = self._lacking(over_m, planes, ((spun, ZERO),)) / max(half, 1e-9)
         above_m = added(over_m, scaled(down_m, up))
         for place in (off_m, turn_at_m, above_m):
             self._require_inside(place, path.off_rad(start), limits.depth_m + rise_m, down_m)
@@ -280,9 +268,9 @@ class TurningWay:
             for place, turn in (
                 (off_m, begun),
                 (turn_at_m, begun),
-                (turn_at_m, swing.last),
-                (turn_at_m, spin.last),
-                (above_m, spin.last),
+                (turn_at_m, swung),
+                (turn_at_m, spun),
+                (above_m, spun),
             )
         )
         self._passed = 0
@@ -313,7 +301,7 @@ class TurningWay:
         self,
         place_m: Vector,
         planes: tuple[tuple[TipPath, float], ...],
-        sweeps: tuple[_Sweep, ...],
+        sweeps: tuple[Sweep, ...],
     ) -> float:
         """How much higher than at a place the tip must be for all sweeps to be clear of all planes [m].
 
@@ -324,7 +312,7 @@ class TurningWay:
             height = dot(plane.normal, difference(place_m, plane.touch_m)) - up_m - MARGIN_M
             lacking = max(lacking, limits.near_m - height)
             if self._tip is not None:
-                edge = min(sweep.lowest(plane.normal, self._tip.housing_m) for sweep in sweeps)
+                edge = min(_lowest(s, plane.normal, self._tip.housing_m) for s in sweeps)
                 lacking = max(lacking, limits.clearance_m - height - self._tip.ball_radius_m - edge)
         return lacking
 
