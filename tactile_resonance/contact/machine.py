@@ -384,11 +384,7 @@ class ContactController:
                 told_m = self._free.told_m
                 self._outcome.reached(now_ns, self._pressing.touched_ns, estimate, told_m)
             if move.to is State.IDLE and not self._rising:
-                observer = self._observer
-                # the second zero is a mean over as long as a lost contact is
-                count = self.limits.lost_s / self.parameters.period_s
-                std_n = math.hypot(observer.bias_std_n, observer.noise_n / math.sqrt(count))
-                self._outcome.drawn_back(self._withdrawal.zero_n, std_n)
+                self._outcome.drawn_back(self._withdrawal.zero_n)
                 self._remember(goal)
             self._enter(move.to, now_ns)
             self._rising = self._rising and move.to is not State.IDLE

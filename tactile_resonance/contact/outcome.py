@@ -79,21 +79,22 @@ class Outcome:
                 peak_force_n=self._observer.watch.peak_n,
             )
 
-    def drawn_back(self, zero_n: float | None, zero_std_n: float) -> None:
+    def drawn_back(self, zero_n: float | None) -> None:
         """Note that the tip is back at the standoff, and what the force source shows there.
 
         Parameters
         ----------
         zero_n : float or None
             None: not known.
-        zero_std_n : float
-            Of the difference of two zeros [N].
         """
-        result = self._result
+        result, observer = self._result, self._observer
         if result is None:
             return
         message, std = result.message, result.force_std_n
         if zero_n is not None:
+            # the second zero is a mean over as long as a lost contact is
+            count = observer.limits.lost_s / observer.parameters.period_s
+            zero_std_n = math.hypot(observer.bias_std_n, observer.noise_n / math.sqrt(count))
             # of what is no noise, the mean may have any part between nothing and all
             moved_n = math.sqrt(max(0.0, zero_n**2 - zero_std_n**2))
             std = None if std is None else math.hypot(std, moved_n / 2)
