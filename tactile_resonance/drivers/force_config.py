@@ -37,12 +37,13 @@ LONGEST_S = 1.0
 
 def _read_bus(value: object, where: str) -> dict[str, Any]:
     bus = read(dict[str, Any], value, where)
-    interface, host, port = (bus.get(name) for name in ("interface", "host", "port"))
+    interface, port = bus.get("interface"), bus.get("port")
     require(isinstance(interface, str), f"{where}.interface", interface, "a name")
     if interface != "socketcand":
         return bus
-    good = isinstance(host, str) and bool(host)
-    require(good, f"{where}.host", host, "a name or an address")
+    for name, accepted in (("host", "a name or an address"), ("channel", "the name of a CAN interface")):
+        good = isinstance(bus.get(name), str) and bool(bus[name])
+        require(good, f"{where}.{name}", bus.get(name), accepted)
     good = type(port) is int and 0 < port < 1 << 16
     require(good, f"{where}.port", port, "an integer from 1 to 65535")
     # without it the kernel holds small packets back for tens of milliseconds

@@ -67,7 +67,11 @@ BLIND = [[0.0] * 5 + [1e-3]] * 2 + [[float(i == j) for j in range(6)] for i in r
         ({"limits": {"lost_tolerated": 0.5}}, "limits.lost_tolerated"),
         ({"bus": {"channel": "can0"}}, "bus.interface"),
         ({"bus": {"interface": "socketcand", "port": 29536}}, "bus.host: got None"),
-        ({"bus": {"interface": "socketcand", "host": "a", "port": 99999}}, "bus.port: got 99999"),
+        ({"bus": {"interface": "socketcand", "host": "a", "port": 9}}, "bus.channel: got None"),
+        (
+            {"bus": {"interface": "socketcand", "host": "a", "channel": "can0", "port": 99999}},
+            "bus.port: got 99999",
+        ),
         ({"latency_s": 1000.0}, "latency_s: got 1000.0; accepted is 0 to 1"),
         ({"rate_hz": 10**400}, "rate_hz: got 1000"),
         ({"frames": "none.yaml"}, "none.yaml: neither a file here nor one of config/force/frames"),
