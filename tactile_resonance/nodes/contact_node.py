@@ -30,7 +30,7 @@ from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
 from tactile_resonance.nodes.indent_conduct import IndentConduct
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode, end_goal, in_thread
 from tactile_resonance.nodes.messages import contact_feedback, contact_goal, contact_result
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import POLES, run_node
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
@@ -38,38 +38,27 @@ from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
 PARAMETERS = (
     *contact_devices.PARAMETERS,
     TIME_SERVER,
-    Parameter(
+    Fixed(
         "publish_rate_hz",
         25.0,
         "Rate of pose, wrench and state [Hz], 50 Hz at most while no contact is under way; a change of the "
         "state is published at once. The wrench is the mean since the last one.",
         1.0,
         500.0,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "touch_from_poles",
         False,
         "First contact is detected by poles too, against those in air: the rest of the approach is slow then. "
         "Poles come once a block, so the approach must be slow already: contact.approach_speed_m_s of 2.5e-4 "
         "for blocks of 0.4 s, with limits.approach_s of 20 s or more, and the client has to ask for "
         "measurements of one or two periods all the time.",
-        read_only=True,
     ),
-    Parameter(
-        "touch_false_alarm",
-        1e-6,
-        "Probability of a false alarm of one block [-].",
-        1e-12,
-        0.1,
-        read_only=True,
-    ),
-    Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
-    Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
-    Parameter(
-        "sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True
-    ),
-    Parameter("tool_frame", "tool", "Frame of the robot's flange or tool.", read_only=True),
+    Fixed("touch_false_alarm", 1e-6, "Probability of a false alarm of one block [-].", 1e-12, 0.1),
+    Fixed("frame_id", "tip", "Frame of the sensor's tip."),
+    Fixed("base_frame", "base", "Frame of the robot's base, of all poses."),
+    Fixed("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball."),
+    Fixed("tool_frame", "tool", "Frame of the robot's flange or tool."),
     BROADCAST_TF,
     *contact_parameters(),
 )

@@ -22,7 +22,7 @@ from tactile_resonance.contact.parameters import (
     read_contact,
 )
 from tactile_resonance.fields import numbers, require
-from tactile_resonance.nodes.parameters import Parameter
+from tactile_resonance.nodes.parameters import Fixed, Parameter
 
 _GROUPS = {"contact": ContactParameters, "limits": Limits}
 # The control loop's period is that of the running loop.
@@ -49,13 +49,9 @@ def contact_parameters() -> tuple[Parameter, ...]:
     for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
         for name, accepted in ranges_of(kind).items():
             full = f"{group}.{name}"
-            limits = (accepted.low, accepted.high)
-            made.append(
-                Parameter(
-                    *(full, getattr(defaults, name), accepted.description, *limits),
-                    read_only=full in _READ_ONLY,
-                )
-            )
+            what = (full, getattr(defaults, name), accepted.description)
+            make = Fixed if full in _READ_ONLY else Parameter
+            made.append(make(*what, accepted.low, accepted.high))
     box = _defaults()[1].workspace
     corners = ((_LOW, box.low_m), (_HIGH, box.high_m))
     return (*made, *(Parameter(full, list(corner), _CORNERS) for full, corner in corners))

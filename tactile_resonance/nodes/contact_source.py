@@ -11,19 +11,18 @@ from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import contact_from_message, spread_from_message
 from tactile_resonance.srv import ForceOver
 
-PARAMETER = Parameter(
+PARAMETER = Fixed(
     "contact_source",
     "force_over",
     "Source of the tip's place and force over a block: the service force_over of contact_node (or of the "
     "simulated bench), or the topic tcp_pose where no force is measured.",
     choices=("force_over", "tcp_pose"),
-    read_only=True,
 )
 
 ANSWER_WITHIN_S = 0.25

@@ -27,7 +27,7 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.goals import answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import excitation_to_message
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.record import BetweenSamples, InputKind
 from tactile_resonance.recording.messages import record_from_message, time_from_message
@@ -38,37 +38,33 @@ if TYPE_CHECKING:
     from tactile_resonance.recording.store import StoredEntry
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "device",
         "bench",
         "What plays and reads: the simulated bench, a recording, or NI hardware.",
         choices=("bench", "replay", "nidaqmx"),
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "device_config",
         "",
         "For replay the folder or file of the recording, for nidaqmx its YAML file (see "
         "config/devices); empty for the bench.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "replay_speed",
         1.0,
         "Signal time over real time of a replay; 0: as fast as possible.",
         0.0,
         1e3,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "record_folder",
         "",
         "Folder that receives every excitation and record before it is published; empty: "
         "tactile_resonance/records/DATE-TIME in $ROS_HOME (~/.ros where that is not set), UTC; for "
         "a replay, which is on disk already, none.",
-        read_only=True,
     ),
-    Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
+    Fixed("frame_id", "tip", "Frame of the sensor's tip."),
 )
 
 

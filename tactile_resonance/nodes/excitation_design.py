@@ -13,7 +13,7 @@ from tactile_resonance.action import Measure
 from tactile_resonance.crest_factor import compress_crest_factor
 from tactile_resonance.drivers.acquisition import DeviceInfo
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, values
 from tactile_resonance.recording.messages import bands_from_message
 from tactile_resonance.sensor import MAX_LEVEL_V
 
@@ -33,13 +33,12 @@ PARAMETERS = (
     Parameter("f_min_hz", 10.0, "Lowest excited line [Hz].", 1e-3, 1e7),
     Parameter("f_max_hz", 10e3, "Highest excited line [Hz].", 1e-3, 1e7),
     Parameter("level_v", 1.0, "Root mean square of the drive [V].", 1e-6, 1e3),
-    Parameter(
+    Fixed(
         "max_level_v",
         MAX_LEVEL_V,
         "The sensor's limit: a level above is refused [V rms].",
         1e-6,
         1e3,
-        read_only=True,
     ),
     Parameter(
         "grid",

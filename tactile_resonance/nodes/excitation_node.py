@@ -24,7 +24,7 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import contact_source, devices, excitation_design
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread
 from tactile_resonance.nodes.messages import excitation_to_message, record_to_message
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS, run_node
 from tactile_resonance.record import Origin, Record
 from tactile_resonance.recording.store import RecordStore
@@ -35,12 +35,11 @@ PARAMETERS = (
     contact_source.PARAMETER,
     TIME_SERVER,
     HUNG_AFTER,
-    Parameter(
+    Fixed(
         "keep_all_records",
         False,
         "Keep in record_folder what the run of a scan holds, too. Else the records of a point that is done are "
         "removed there as soon as point_result tells that all of them are in its run, on the disk.",
-        read_only=True,
     ),
     Parameter("block_timeout_s", 10.0, "Longest wait for a block [s].", 0.1, 3600.0),
 )

@@ -22,7 +22,7 @@ from tactile_resonance.nodes.bench_player import (
 )
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
-from tactile_resonance.nodes.parameters import Parameter, file_of, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, file_of, values
 from tactile_resonance.nodes.running import RESULTS, run_node
 from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_to_response
 from tactile_resonance.nodes.stop_input import StopInput
@@ -35,39 +35,35 @@ from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.srv import Play, Truth
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "scene",
         "config/scenes/gelatine_phantoms.yaml",
         "What lies on the table: a file, absolute or in the package's share folder.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "robot_host",
         "",
         "Address 127.x.y.z at which a simulated robot with its load cell is started too; the tip is then "
         "where that robot holds it. Empty: ideal contact.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "serve_contact",
         False,
         "Without a robot: serve make_contact and retract with ideal contact, as contact_node does; else the "
         "tip is where tcp_pose states.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "table_in_base",
         [*TABLE_IN_BASE],
         "Frame of the scene in the robot's base: position [m] and rotation vector [rad].",
-        read_only=True,
     ),
     TIME_SERVER,
     Parameter("seed", 1, "Seed of the simulated noise.", 1, 2**62),
     Parameter("noise", True, "Sensor noise."),
     Parameter("quantisation", True, "Converters that count and saturate."),
     Parameter("nonlinearity", False, "The sensor's static nonlinearity."),
-    Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
-    Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
+    Fixed("frame_id", "tip", "Frame of the sensor's tip."),
+    Fixed("base_frame", "base", "Frame of the robot's base, of all poses."),
 )
 
 

@@ -32,7 +32,7 @@ from tactile_resonance import msg
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.nodes.diagnostics import Health
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, declare, values
 from tactile_resonance.nodes.running import BEATS, STEADY, RCLError
 
 # What a configuration may be refused with; anything else is a defect and keeps its traceback.
@@ -44,21 +44,19 @@ BEAT_S = 0.2
 KEEP_RESULT_S = 900
 """The result of a goal that has ended can be asked for so long [s]."""
 
-TIME_SERVER = Parameter(
+TIME_SERVER = Fixed(
     "time_server",
     "",
     "Address HOST:PORT of a simulated bench's time, in which the node then lives; empty: the machine's clock.",
-    read_only=True,
 )
 
-HUNG_AFTER = Parameter(
+HUNG_AFTER = Fixed(
     "hung_after_s",
     60.0,
     "In simulated time: a node without an answer for so long, by this machine's clock, hangs [s]; the "
     "scan ends, and can be resumed.",
     5.0,
     86400.0,
-    read_only=True,
 )
 
 

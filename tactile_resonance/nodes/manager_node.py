@@ -16,18 +16,13 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from tactile_resonance.nodes.diagnostics import Health
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, declare, values
 from tactile_resonance.nodes.running import STEADY, run_node
 
 STREAM_NODES = ["excitation_node", "frf_node", "poles_node"]
 
 PARAMETERS = (
-    Parameter(
-        "nodes",
-        STREAM_NODES,
-        "Names of the managed nodes, in the order in which they come up.",
-        read_only=True,
-    ),
+    Fixed("nodes", STREAM_NODES, "Names of the managed nodes, in the order in which they come up."),
     Parameter("answer_timeout_s", 15.0, "Longest wait for a node to change [s].", 0.1, 3600.0),
     Parameter("retry_s", 1.0, "First wait after a refusal [s]; doubled each time.", 0.05, 60.0),
 )

@@ -18,7 +18,7 @@ from tactile_resonance.configuration import shared_file
 from tactile_resonance.fields import build, counted, numbers, require
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, pose_of, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
 from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.adaptive import WantedBoundary
@@ -41,37 +41,33 @@ from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import read_classes
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "source",
         "point_result",
         "What is on the map: the points of tissue that a scan accepts (point_result), or the latest poles "
         "of every place, whoever measured them and whatever for (poles).",
         choices=("point_result", "poles"),
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "frame_id",
         "",
         "Frame of the map; poles in another one than this and base_frame are left out. Empty: that of the "
         "first poles.",
-        read_only=True,
     ),
-    Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
-    Parameter(
+    Fixed("base_frame", "base", "Frame of the robot's base."),
+    Fixed(
         "table_in_base",
         [0.0] * 6,
         "Pose of frame_id in base_frame, position [m] and rotation vector [rad], that of scan_node: where "
         "frame_id is given, poles in base_frame are shown in it.",
-        read_only=True,
     ),
-    Parameter("tip_frame", "tip", "Frame of the tip that is broadcast.", read_only=True),
+    Fixed("tip_frame", "tip", "Frame of the tip that is broadcast."),
     BROADCAST_TF,
-    Parameter(
+    Fixed(
         "classes_file",
         "",
         "YAML file with tissue_classes and their nominal_contact, a scene for example; empty: no tissue is "
         "called.",
-        read_only=True,
     ),
     Parameter(
         "unknown_level",
@@ -101,27 +97,24 @@ PARAMETERS = (
         0.0,
         1e6,
     ),
-    Parameter(
+    Fixed(
         "band",
         1,
         "Of measurements in several bands the one that is mapped, in the order of the scene; tissue is "
         "called from the first only.",
         1,
         100,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "boundary_f0_hz",
         [0.0, 0.0],
         "The boundary of what lies between two frequencies [Hz] is drawn, with the band that holds it (95 %); "
         "0: none on that side, both: no boundary.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "adaptive_scene",
         "",
         "Scene with adaptive positions whose boundary is drawn as its scan finds it; empty: boundary_f0_hz.",
-        read_only=True,
     ),
     Parameter("surface_cells", 40, "Cells along the longer side of the surface.", 4, 200),
 )

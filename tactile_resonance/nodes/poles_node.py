@@ -11,7 +11,7 @@ from tactile_resonance.calibration.file import read_calibration
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import frf_from_message, poles_to_message
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, values
 from tactile_resonance.nodes.running import POLES, RESULTS, run_node
 from tactile_resonance.poles.compiled import compiled
 from tactile_resonance.poles.estimator import POLES_METHODS, poles_of_bands
@@ -52,12 +52,11 @@ PARAMETERS = (
         "the FRF brings the bins.",
         choices=POLES_METHODS,
     ),
-    Parameter(
+    Fixed(
         "calibration",
         "",
         "File of `tactile_resonance calibrate`: poles of the first band through this sensor, from rest; where "
         "data contradict it, or lines outside of the band are excited, as without. Empty: none.",
-        read_only=True,
     ),
 )
 

@@ -26,7 +26,7 @@ from tactile_resonance.nodes.managed_node import (
     end_goal,
     in_thread,
 )
-from tactile_resonance.nodes.parameters import Parameter, pose_of, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
 from tactile_resonance.nodes.running import POINT_RESULTS, run_node
 from tactile_resonance.nodes.scan_actions import (
     calibrate,
@@ -49,41 +49,36 @@ from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.table_calibration import CalibrationRequest
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "contact",
         "robot",
         "What brings the tip to the tissue: contact_node, or nothing (the tip is taken to be where the plan "
         "states, and its pose is published).",
         choices=("robot", "none"),
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "table_in_base",
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         "The table in the robot's base: position [m] and rotation vector [rad].",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "table_frame",
         "table",
         "Frame of the table: of poses without a scene, and of scenes that name none.",
-        read_only=True,
     ),
-    Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
+    Fixed("base_frame", "base", "Frame of the robot's base."),
     BROADCAST_TF,
-    Parameter(
+    Fixed(
         "run_folder",
         "",
         "Folder of the runs that name none; empty: tactile_resonance/runs in $ROS_HOME (~/.ros where "
         "that is not set).",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "goal_folders",
         [""],
         "Folders in which files and run folders of goals may be, beside the package's scenes and run_folder; "
         "/ for any.",
-        read_only=True,
     ),
     Parameter("seed", 1, "Seed of the phases of the first point.", 1, 2**62),
     TIME_SERVER,
