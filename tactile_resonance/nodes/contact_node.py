@@ -9,7 +9,6 @@ from typing import Any
 
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
-from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
@@ -126,7 +125,7 @@ class ContactNode(ManagedNode):
             began_ns = clock.ros_ns(clock.now_ns())
             self._touch = TouchFromPoles(false_alarm, began_ns)
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
-        self.serve(Trigger, "retract", self._on_retract)
+        self.serve_trigger("retract", self._on_retract)
         self._teller = self.every(FEEDBACK_EVERY_S, self._tell)
         for kind, name, serve in (
             (MakeContact, "make_contact", self._on_goal),
@@ -262,21 +261,14 @@ class ContactNode(ManagedNode):
         if self._thread is not None:
             self._thread.retract()
 
-    async def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def _on_retract(self) -> str:
         thread = self._thread
-        try:
-            if thread is not None and thread.controller.state is State.FAULT:
-                await in_thread(self, thread.make_ready, "make_ready")  # other requests are taken
-        except ArmError as error:
-            response.message = str(error)
-            return response
+        if thread is not None and thread.controller.state is State.FAULT:
+            await in_thread(self, thread.make_ready, "make_ready")  # other requests are taken
         if thread is None or thread is not self._thread:
-            response.message = f"contact_node is {self.state_name()}"
-            return response
+            raise ValueError(f"contact_node is {self.state_name()}")
         thread.retract()
-        response.success = True
-        response.message = "asked; contact_state reports when it is idle"
-        return response
+        return "asked; contact_state reports when it is idle"
 
     # what the loop has done, in the executor's thread
 

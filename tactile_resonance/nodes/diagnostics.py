@@ -25,9 +25,8 @@ class _Flow:
     """Messages of one topic, in or out."""
 
     total: int = 0
-    reported: int = 0
     last_s: float = float("nan")
-    took_s: list[float] = field(default_factory=list)
+    took_s: list[float] = field(default_factory=list)  # of each since the last report
 
 
 class Health:
@@ -58,15 +57,12 @@ class Health:
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.create_timer(PERIOD_S, self._publish, clock=STEADY)
 
-    def saw(self, topic: str) -> None:
-        """Count one message of a topic."""
+    def saw(self, topic: str, seconds: float) -> None:
+        """Count one message of a topic, which kept the node busy for so long [s]."""
         flow = self._flows.setdefault(topic, _Flow())
         flow.total += 1
         flow.last_s = time.monotonic()
-
-    def took(self, topic: str, seconds: float) -> None:
-        """Keep how long one message of a topic kept the node busy."""
-        self._flows.setdefault(topic, _Flow()).took_s.append(seconds)
+        flow.took_s.append(seconds)
 
     def error(self, text: str) -> None:
         """Log an error and remember it."""
@@ -97,8 +93,7 @@ class Health:
             message = f"{state}: {self._error}"
         values = {"state": state}
         for topic, flow in self._flows.items():
-            rate_hz = (flow.total - flow.reported) / (now_s - self._reported_s)
-            flow.reported = flow.total
+            rate_hz = len(flow.took_s) / (now_s - self._reported_s)
             if flow.took_s:
                 mean_s = sum(flow.took_s) / len(flow.took_s)
                 values[f"{topic}{MEAN}"] = f"{1e3 * mean_s:.3g}"

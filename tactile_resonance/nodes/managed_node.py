@@ -8,7 +8,7 @@ import os
 import threading
 import time
 import traceback
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Any
@@ -35,7 +35,7 @@ from tactile_resonance.nodes.diagnostics import Health
 from tactile_resonance.nodes.parameters import Fixed, Parameter, declare, values
 from tactile_resonance.nodes.running import BEATS, STEADY, RCLError
 
-# What a configuration may be refused with; anything else is a defect and keeps its traceback.
+# What a configuration or a request may be refused with; anything else is a defect and keeps its traceback.
 REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterException)
 
 BEAT_S = 0.2
@@ -146,10 +146,9 @@ class ManagedNode(LifecycleNode):
 
         def heard(message: Any) -> None:
             if self.active or always:
-                self.health.saw(topic)
                 begun_s = time.perf_counter()
                 callback(message)
-                self.health.took(topic, time.perf_counter() - begun_s)
+                self.health.saw(topic, time.perf_counter() - begun_s)
 
         subscription = self.create_subscription(kind, topic, heard, qos, raw=raw)
         self.resources.callback(self.destroy_subscription, subscription)
@@ -161,14 +160,14 @@ class ManagedNode(LifecycleNode):
         service = self.create_service(kind, name, callback, callback_group=group)
         self.resources.callback(self.destroy_service, service)
 
-    def serve_trigger(self, name: str, do: Callable[[], str]) -> None:
-        """Service without a request; `do` returns the answer's message, or raises ``ValueError`` with why."""
+    def serve_trigger(self, name: str, do: Callable[[], str | Awaitable[str]]) -> None:
+        """Service without a request; `do` returns the answer, or raises one of `REFUSALS` with why."""
 
-        def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        async def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
-                response.message = do()
+                response.message = await await_or_execute(do)
                 response.success = True
-            except ValueError as error:
+            except REFUSALS as error:
                 response.message = str(error)
             return response
 
@@ -214,18 +213,17 @@ class ManagedNode(LifecycleNode):
         )
         self.resources.callback(server.destroy)
 
-    def set_up(self, make: Callable[[], None]) -> Callable[[], None]:
-        """Run `make`, and return a function that undoes all that it set up.
-
-        Without a call of that function it is undone when the node is cleaned up.
-        """
+    @contextlib.contextmanager
+    def with_set_up(self, make: Callable[[], None]) -> Iterator[None]:
+        """Run `make`; all that it set up is undone at the end of the context, or as the node is cleaned up."""
         rest, self.resources = self.resources, ExitStack()
         try:
             make()
         finally:
             made, self.resources = self.resources, rest
             self.resources.callback(made.close)
-        return made.close
+        with made:
+            yield
 
     def every(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Timer until the node is cleaned up; called while it is active, by this machine's clock."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from tactile_resonance import msg
@@ -176,10 +175,9 @@ class PoleMapNode(ManagedNode):
             "point_result": (msg.PointResult, self._on_result, POINT_RESULTS),
             "poles": (msg.Poles, self._on_poles, POLES),
         }[source]
-        subscription = self.create_subscription(kind, source, callback, qos)
-        self.resources.callback(self.destroy_subscription, subscription)
+        self.listen(kind, source, callback, qos, always=True)
         TipBroadcaster(self, *values(self, "tip_frame"))
-        self.serve(Trigger, "pole_map/clear", self._on_clear)
+        self.serve_trigger("pole_map/clear", self._clear)
         # the frame may be known from now on only
         self.every(REPEAT_PERIOD_S, lambda: self._show(repeat=True))
 
@@ -196,7 +194,6 @@ class PoleMapNode(ManagedNode):
         }
 
     def _on_poles(self, message: msg.Poles) -> None:
-        self.health.saw("poles")
         point = self._point(message)
         if point is not None:
             self._grown.add(point)
@@ -204,7 +201,6 @@ class PoleMapNode(ManagedNode):
 
     def _on_result(self, message: msg.PointResult) -> None:
         """The latest result of a point of tissue that is not discarded replaces what was there before."""
-        self.health.saw("point_result")
         result = from_message(message)
         if not counts(result):
             return
@@ -254,12 +250,10 @@ class PoleMapNode(ManagedNode):
             return None
         return point
 
-    def _on_clear(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.message = f"{counted(len(self._grown), 'point')} cleared"
-        response.success = True
-        self._grown = GrowingMap()
+    def _clear(self) -> str:
+        cleared, self._grown = len(self._grown), GrowingMap()
         self._renew()
-        return response
+        return f"{counted(cleared, 'point')} cleared"
 
     def _renew(self) -> None:
         """Show the map, which is another than before."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -114,17 +114,12 @@ class NodeHands:
         else:
             self._pose = node.publish_on(PoseStamped, "tcp_pose", PLACES)
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
+    def listening(self) -> AbstractContextManager[None]:
         """Subscribe to what a scan needs while there is one: idle, each message would cost as much.
 
         To be entered and left in the executor's thread.
         """
-        stop = self._node.set_up(self._listen)
-        try:
-            yield
-        finally:
-            stop()
+        return self._node.with_set_up(self._listen)
 
     def _listen(self) -> None:
         self._waited_for = ""

@@ -14,7 +14,6 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from std_srvs.srv import Trigger
 
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import (
@@ -131,7 +130,7 @@ def test_other_requests_are_served_while_the_program_of_an_arm_is_started_again(
     )
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    task = executor.create_task(node._on_retract, Trigger.Request(), Trigger.Response())
+    task = executor.create_task(node._on_retract)
     while not begun.is_set():
         executor.spin_once(0.1)
     go_on.set()  # only an executor that is free comes to this before the wait has ended
@@ -139,7 +138,7 @@ def test_other_requests_are_served_while_the_program_of_an_arm_is_started_again(
         executor.spin_once(0.1)
     executor.remove_node(node)
     assert asked == [True, "retract"]
-    assert task.result().success
+    assert task.result().startswith("asked")
 
 
 @pytest.mark.parametrize("ends", [True, False])
