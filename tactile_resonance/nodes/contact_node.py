@@ -80,7 +80,8 @@ class ContactNode(ManagedNode):
         super().__init__("contact_node", PARAMETERS)
         self._thread: ContactThread | None = None
         self._arm: NodeArm | None = None
-        self._stop = StopInput(self, self._draw_back)
+        self._stop = StopInput(self)
+        self._stop.draw_back = self._draw_back
         (stalls_s,) = values(self, "simulated_stalls_s")
         self._settings = ContactSettings(self, stalls_s, self._require_allowed, self._take)
 

@@ -87,7 +87,8 @@ class ContactTopics:
         if wrenches and self._wrench.get_subscription_count():
             self._wrench.publish(wrench_message(wrenches, cycle, ros_ns, self._frame_id))
         controller, loop = thread.controller, thread.loop
-        state = contact_state(cycle, ros_ns, controller.estimate, controller.result, self._frame_id)
+        what = cycle.state, ros_ns(cycle.time_ns), controller.estimate, controller.result
+        state = contact_state(*what, self._frame_id)
         if cycle.state is State.HOLD:
             motion = controller.motion
             state.message = "" if motion is None else str(motion)

@@ -13,19 +13,14 @@ from tactile_resonance import msg
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import ClockLostError
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.bench_player import (
-    BenchNow,
-    BenchPlayer,
-    BenchServer,
-    PlantChild,
-    bench_record,
-)
+from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchServer, PlantChild
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
 from tactile_resonance.nodes.parameters import Fixed, Parameter, file_of, values
 from tactile_resonance.nodes.running import RESULTS, run_node
-from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_to_response
+from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_message, truth_to_response
 from tactile_resonance.nodes.stop_input import StopInput
+from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
@@ -90,7 +85,7 @@ class FakeHardwareNode(ManagedNode):
         self._played: tuple[int, Play.Response] | None = None  # what is played, and the answer
         self._touch: SimulatedTip | None = None
         (serves_contact,) = values(self, "serve_contact")
-        self._stop = StopInput(self, self._draw_back) if serves_contact else None
+        self._stop = StopInput(self) if serves_contact else None
 
     def configure(self) -> None:
         """Read the scene, make the sensor and, if the parameters ask for one, the robot."""
@@ -130,10 +125,6 @@ class FakeHardwareNode(ManagedNode):
         self._player.silence()
         self._played = None
         return ""
-
-    def _draw_back(self) -> None:
-        if self._touch is not None:
-            self._touch.draw_back()
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
         try:
@@ -222,8 +213,18 @@ class FakeHardwareNode(ManagedNode):
             if so_far is not None:
                 so_far.extend(excitation.period_s, touch.contact_over(end_ns - block_ns, end_ns))
                 pose.header.stamp = time_message((start_ns + end_ns) // 2)
-                touch.tell_truth(pose, tip, excitation.measurement_id, so_far.parts)
-            record = bench_record(next(blocks), excitation, start_ns, self._frame_id)
+                whose = excitation.measurement_id, self._frame_id
+                touch.truths.publish(truth_message(pose, tip, so_far.parts, *whose))
+            block = next(blocks)
+            origin = Origin(
+                measurement_id=excitation.measurement_id,
+                excitation_id=excitation.excitation_id,
+                time_ns=start_ns + block.origin.time_ns,
+                frame_id=self._frame_id,
+                label=excitation.label,
+                simulated=True,
+            )
+            record = replace(block, realisation=excitation.realisation, origin=origin)
             self._blocks.publish(record_to_message(record))
 
         return hand_out

@@ -32,7 +32,12 @@ from tactile_resonance.contact.result import (
     refusal_cause,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
-from tactile_resonance.nodes.messages import contact_result, time_message, write_force_over
+from tactile_resonance.nodes.messages import (
+    contact_result,
+    contact_state,
+    time_message,
+    write_force_over,
+)
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.recording.messages import time_from_message
@@ -42,7 +47,6 @@ CONTACT_S = 0.5
 """From a goal to the force that it asks for [s]: about as long as a robot that is near takes."""
 PUBLISH_S = 0.05
 MOST_STAYS = 1000
-NAN = math.nan
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,7 @@ class IdealContact:
         self._state: State = State.IDLE
         self._result: ContactResult | None = None
         self._stop = stop
+        stop.draw_back = self.draw_back
         self._states = node.publish_on(msg.ContactState, "contact_state", STREAM)
         self._poses = node.publish_on(PoseStamped, "tcp_pose", STREAM)
         self._wrenches = node.publish_on(WrenchStamped, "wrench", STREAM)
@@ -191,9 +196,8 @@ class IdealContact:
             missing = not_reached(Cause.SURFACE_MISSING, "nothing to touch there")
             return self._say(State.IDLE, missing)
         now_ns = self._now_ns()
-        pose = PoseStamped(header=request.pose.header, pose=request.pose.pose)
-        pose.header.stamp = time_message(now_ns)
-        self._stays.add(Stay(now_ns, request.force_n, pose))
+        request.pose.header.stamp = time_message(now_ns)
+        self._stays.add(Stay(now_ns, request.force_n, request.pose))
         self._placed()
         took_s, (depth_m, surface_m) = (now_ns - began_ns) * 1e-9, found
         reached = ContactResult(
@@ -263,21 +267,16 @@ class IdealContact:
         return result
 
     def _publish(self) -> None:
-        now = time_message(self._now_ns())
-        stay, result = self._stays.newest, self._result
-        state = msg.ContactState(state=self._state.value, force_n=NAN, depth_m=NAN)
-        state.header.stamp, state.header.frame_id = now, self._frame_id
+        now_ns = self._now_ns()
+        stay, result, now = self._stays.newest, self._result, time_message(now_ns)
+        state = contact_state(self._state, now_ns, None, result, self._frame_id)
         state.instance, state.stopped = self._node.instance, self._stop.stopped
-        state.zero_moved_n = state.stiffness_n_per_m = state.tissue_moves_m = NAN
-        if result is not None:
-            state.cause, state.message = result.cause.value, result.message
         if self._state is State.HOLD:
             state.force_n, state.depth_m = stay.force_n, result.depth_m
         self._states.publish(state)
         if stay.pose.header.frame_id:
-            pose = PoseStamped(header=stay.pose.header, pose=stay.pose.pose)
-            pose.header.stamp = now
-            self._poses.publish(pose)
+            stay.pose.header.stamp = now
+            self._poses.publish(stay.pose)
         self._wrenches.publish(pressing(stay.force_n, now, self._frame_id))
 
 

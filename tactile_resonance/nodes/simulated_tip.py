@@ -64,6 +64,8 @@ class SimulatedTip:
     stays : Stays
     stalls : int
         How often the simulated robot stood still.
+    truths : publisher
+        Of `truth_message`.
     """
 
     def __init__(
@@ -80,8 +82,7 @@ class SimulatedTip:
         table, self._frame_id, base_frame = values(node, "table_in_base", "frame_id", "base_frame")
         self._laid = LaidScene(scene, pose_of(table, "table_in_base"))
         self.tip, self.stays, self.stalls = BenchTip(None, 0.0, 1.0), Stays(), 0
-        self._truths = node.publish_on(msg.Poles, "bench/truth", TRUTHS)
-        self._contact: IdealContact | None = None
+        self.truths = node.publish_on(msg.Poles, "bench/truth", TRUTHS)
         if plant is not None:
             node.every(PLANT_CHECK_S, self._check_plant)
             return
@@ -90,7 +91,7 @@ class SimulatedTip:
             x, y, z = (table.position_m + table.rotation.apply([0.0, 0.0, CLEAR_M])).tolist()
             place = Contact(position_m=(x, y, z), frame_id=base_frame)
             self.stays.add(Stay(0, 0.0, pose_to_message(place)))
-            self._contact = IdealContact(
+            IdealContact(
                 node,
                 self.stays,
                 self._found_at,
@@ -106,11 +107,6 @@ class SimulatedTip:
             node.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
             node.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
         node.serve(ForceOver, "force_over", self.stays.serve)
-
-    def draw_back(self) -> None:
-        """Lift the tip off, where goals put it."""
-        if self._contact is not None:
-            self._contact.draw_back()
 
     def at(self, place_m: tuple[float, float, float]) -> BenchTip:
         """A tip at a place of the scene, at the scene's force."""
@@ -152,20 +148,10 @@ class SimulatedTip:
         rows = zip(*(answer[name] for name in names), strict=True)
         return [None if row[0] is None else row for row in rows]
 
-    def tell_truth(
-        self,
-        pose: PoseStamped,
-        tip: BenchTip,
-        measurement_id: int = 0,
-        parts: Sequence[CoupledBimorph] = (),
-    ) -> None:
-        """Publish the exact poles of a tip at a pose; see `truth_message`."""
-        coupled = parts or [tip.coupled(self._bench)]
-        self._truths.publish(truth_message(pose, tip, coupled, measurement_id, self._frame_id))
-
     def _put(self, tip: BenchTip) -> None:
         self.tip = tip
-        self.tell_truth(self.stays.newest.pose, tip)
+        pose, coupled = self.stays.newest.pose, [tip.coupled(self._bench)]
+        self.truths.publish(truth_message(pose, tip, coupled, 0, self._frame_id))
 
     def _found_at(self, place_m: np.ndarray, force_n: float) -> tuple[float, float] | None:
         """Depth that brings a force at a place in the base, and height of the surface above that place."""
