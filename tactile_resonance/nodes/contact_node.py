@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
@@ -203,23 +202,24 @@ class ContactNode(ManagedNode):
         return "" if self._fault is None else str(self._fault)
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
-        def read() -> ContactGoal:
-            return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
+        def read() -> tuple[ContactGoal, None]:
+            return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m), None
 
         outcome, _ = await self._outcome_of(goal, read)
         end_goal(goal, outcome.reached and not goal.is_cancel_requested)
         return contact_result(outcome)
 
     async def _on_indent(self, goal: ServerGoalHandle) -> Indent.Result:
-        def read() -> IndentConduct:
+        def read() -> tuple[ContactGoal, IndentConduct]:
             stiffness = self._settings.parameters.beam_n_per_m
-            return IndentConduct(
+            test = IndentConduct(
                 goal.request,
                 self._base_frame,
                 BallTip(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
                 self._force.info,
                 simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
             )
+            return test.goal, test
 
         outcome, test = await self._outcome_of(goal, read)
         result = Indent.Result(cause=outcome.cause.value, message=outcome.message)
@@ -229,9 +229,9 @@ class ContactNode(ManagedNode):
         return result
 
     async def _outcome_of(
-        self, goal: ServerGoalHandle, read: Callable[[], ContactGoal | IndentConduct]
-    ) -> tuple[ContactResult, Any]:
-        """What became of a goal, and what it was; None: it was not begun, or the node was stopped."""
+        self, goal: ServerGoalHandle, read: Callable[[], tuple[ContactGoal, IndentConduct | None]]
+    ) -> tuple[ContactResult, IndentConduct | None]:
+        """What became of a goal, and its test; None: it has none, was not begun, or the node was stopped."""
         try:
             if self._thread is None:
                 raise ValueError("contact_node is not active")
@@ -243,20 +243,18 @@ class ContactNode(ManagedNode):
                 abort_force_n=goal.request.abort_force_n or None,
                 depth_m=goal.request.depth_limit_m or None,
             )
-            what = read()
-            asked = what.goal if isinstance(what, IndentConduct) else what
+            asked, test = read()
             require_fit(self._force.info, asked.aim.force_n)
             self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
             self.health.error(f"refused: {error}")
             return not_reached(refusal_cause(error), str(error)), None
-        self._goal, self._finished = goal, Future()
-        self._test = what if isinstance(what, IndentConduct) else None
+        self._goal, self._finished, self._test = goal, Future(), test
         outcome: ContactResult | None = await self._finished
         self._goal = self._finished = self._test = None
         if outcome is None:
             return not_reached(Cause.STOPPED, "contact_node was stopped"), None
-        return outcome, what
+        return outcome, test
 
     def _draw_back(self) -> None:
         if self._thread is not None:

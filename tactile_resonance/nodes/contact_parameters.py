@@ -25,22 +25,10 @@ from tactile_resonance.fields import numbers, require
 from tactile_resonance.nodes.parameters import Fixed, Parameter
 
 _GROUPS = {"contact": ContactParameters, "limits": Limits}
-# The control loop's period is that of the running loop.
-_READ_ONLY = frozenset({"contact.period_s"})
 _LOW, _HIGH = "limits.workspace.low_m", "limits.workspace.high_m"
 _CORNERS = "Opposite corners of the box in which the tip may be, in the base [m]."
-_AT_MOST = frozenset(
-    {
-        *(
-            f"{g}.{n}"
-            for g, kind in _GROUPS.items()
-            for n in ranges_of(kind)
-            if n in STRICTER_BELOW
-        ),
-        _HIGH,
-    }
-)
-_AT_LEAST = frozenset({*(f"limits.{name}" for name in STRICTER_ABOVE), _LOW})
+# Last parts of the names of what a launch limits.
+_AT_MOST, _AT_LEAST = STRICTER_BELOW | {"high_m"}, STRICTER_ABOVE | {"low_m"}
 
 
 def contact_parameters() -> tuple[Parameter, ...]:
@@ -50,7 +38,8 @@ def contact_parameters() -> tuple[Parameter, ...]:
         for name, accepted in ranges_of(kind).items():
             full = f"{group}.{name}"
             what = (full, getattr(defaults, name), accepted.description)
-            make = Fixed if full in _READ_ONLY else Parameter
+            # that of the loop which runs
+            make = Fixed if full == "contact.period_s" else Parameter
             made.append(make(*what, accepted.low, accepted.high))
     box = _defaults()[1].workspace
     corners = ((_LOW, box.low_m), (_HIGH, box.high_m))
@@ -86,7 +75,7 @@ class ContactSettings:
     ) -> None:
         self._node, self._longer_s = node, longer_s
         self._require_allowed, self._take = require_allowed, take
-        names = (*_AT_MOST, *_AT_LEAST)
+        names = [p.name for p in contact_parameters() if _last(p.name) in _AT_MOST | _AT_LEAST]
         self._launched = {name: node.get_parameter(name).value for name in names}
         node.add_on_set_parameters_callback(self._on_change)
 
@@ -122,7 +111,7 @@ class ContactSettings:
         """Raise ``ValueError`` where what protects the tissue would admit more than at the launch."""
         for name in changed.keys() & self._launched.keys():
             value, limit = np.array(changed[name]), np.array(self._launched[name])
-            at_most = name in _AT_MOST
+            at_most = _last(name) in _AT_MOST
             stricter = value.shape == limit.shape and (
                 value <= limit if at_most else value >= limit
             )
@@ -154,6 +143,10 @@ def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limi
     limits = replace(limits, workspace=Workspace(*corners))
     limits.check(parameters)
     return parameters, limits
+
+
+def _last(name: str) -> str:
+    return name.rpartition(".")[2]
 
 
 @cache

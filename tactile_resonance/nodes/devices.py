@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import queue
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -127,16 +127,13 @@ def _entries_of(path: Path) -> list[StoredEntry] | None:
     return run_entries(path)
 
 
-def open_store(
-    folder: str, device: str, environment: Mapping[str, str] = os.environ
-) -> RecordStore | None:
+def open_store(folder: str, device: str) -> RecordStore | None:
     """The store of a node's records.
 
     Parameters
     ----------
     folder, device : str
         The parameters ``record_folder`` and ``device``.
-    environment : mapping
 
     Returns
     -------
@@ -152,8 +149,8 @@ def open_store(
         return RecordStore(Path(folder).expanduser().absolute())
     if device == "replay":
         return None
-    home = environment.get("ROS_HOME")
-    parent = (Path(home) if home else Path.home() / ".ros") / "tactile_resonance" / "records"
+    home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+    parent = home / "tactile_resonance" / "records"
     parent.mkdir(parents=True, exist_ok=True)
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     number = 1
