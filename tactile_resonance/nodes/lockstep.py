@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from tactile_resonance.clock import Demand, OfRosTime
+from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.nodes.running import PLACES
 from tactile_resonance.recording.messages import time_from_message
 
@@ -43,7 +43,7 @@ class Arrivals:
             return self._changed.wait_for(lambda: self.newest_ns >= stamp_ns, seconds)
 
 
-class Lockstep(OfRosTime):
+class Lockstep(Clock):
     """The clock of a loop that a simulated controller leads, and that leads it (a `LoopClock`).
 
     Parameters
