@@ -29,7 +29,7 @@ from tactile_resonance.nodes.indent_conduct import IndentConduct
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode, end_goal, in_thread
 from tactile_resonance.nodes.messages import contact_feedback, contact_goal, contact_result
 from tactile_resonance.nodes.parameters import Fixed, values
-from tactile_resonance.nodes.running import POLES, run_node
+from tactile_resonance.nodes.running import POLES
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
 
@@ -359,10 +359,7 @@ class ContactNode(ManagedNode):
         self._topics.take(cycle, thread)
 
 
-def main() -> None:
-    """Console script."""
-    run_node(ContactNode)
-
+main = ContactNode.run
 
 if __name__ == "__main__":
     main()

@@ -25,7 +25,7 @@ from tactile_resonance.nodes import contact_source, devices, excitation_design
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread
 from tactile_resonance.nodes.messages import excitation_to_message, record_to_message
 from tactile_resonance.nodes.parameters import Fixed, Parameter, values
-from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS, run_node
+from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS
 from tactile_resonance.record import Origin, Record
 from tactile_resonance.recording.store import RecordStore
 
@@ -281,7 +281,7 @@ def main() -> None:
     """Console script."""
     # the thread that reads the device takes over from that of the executor within this, and not 5 ms
     sys.setswitchinterval(1e-4)
-    run_node(ExcitationNode)
+    ExcitationNode.run()
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchSer
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
 from tactile_resonance.nodes.parameters import Fixed, Parameter, file_of, values
-from tactile_resonance.nodes.running import RESULTS, run_node
+from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_message, truth_to_response
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.record import Origin
@@ -230,10 +230,7 @@ class FakeHardwareNode(ManagedNode):
         return hand_out
 
 
-def main() -> None:
-    """Console script."""
-    run_node(FakeHardwareNode)
-
+main = FakeHardwareNode.run
 
 if __name__ == "__main__":
     main()

@@ -33,7 +33,7 @@ from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.nodes.diagnostics import Health
 from tactile_resonance.nodes.parameters import Fixed, Parameter, declare, values
-from tactile_resonance.nodes.running import BEATS, STEADY, RCLError
+from tactile_resonance.nodes.running import BEATS, STEADY, RCLError, run_node
 
 # What a configuration or a request may be refused with; anything else is a defect and keeps its traceback.
 REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterException)
@@ -92,6 +92,11 @@ class ManagedNode(LifecycleNode):
         self._beats = self.create_publisher(
             msg.Heartbeat, "heartbeat", BEATS, event_callbacks=events
         )
+
+    @classmethod
+    def run(cls) -> None:
+        """Make and spin one, as the console script of its module does."""
+        run_node(cls)
 
     # What a subclass defines
 

@@ -18,7 +18,7 @@ from tactile_resonance.fields import build, counted, numbers, require
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
-from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
+from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.adaptive import WantedBoundary
 from tactile_resonance.scan.level_set import Boundary, LevelSet
@@ -331,10 +331,7 @@ def _boundary_of(
     return lambda pole_map: adaptive.boundary(pole_map.placed)
 
 
-def main() -> None:
-    """Console script."""
-    run_node(PoleMapNode)
-
+main = PoleMapNode.run
 
 if __name__ == "__main__":
     main()

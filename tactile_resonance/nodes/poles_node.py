@@ -12,7 +12,7 @@ from tactile_resonance.frf.result import FRF
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import frf_from_message, poles_to_message
 from tactile_resonance.nodes.parameters import Fixed, Parameter, values
-from tactile_resonance.nodes.running import POLES, RESULTS, run_node
+from tactile_resonance.nodes.running import POLES, RESULTS
 from tactile_resonance.poles.compiled import compiled
 from tactile_resonance.poles.estimator import POLES_METHODS, poles_of_bands
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -104,10 +104,7 @@ class PolesNode(ManagedNode):
         return calibrated_poles(frf, bands, self._sensor, force_n, force_std_n, method)
 
 
-def main() -> None:
-    """Console script."""
-    run_node(PolesNode)
-
+main = PolesNode.run
 
 if __name__ == "__main__":
     main()

@@ -27,7 +27,7 @@ from tactile_resonance.nodes.managed_node import (
     in_thread,
 )
 from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
-from tactile_resonance.nodes.running import POINT_RESULTS, run_node
+from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_actions import (
     calibrate,
     calibration_request,
@@ -379,10 +379,7 @@ class ScanNode(ManagedNode):
             goal.publish_feedback(scan_feedback(progress, self._run_directory))
 
 
-def main() -> None:
-    """Console script."""
-    run_node(ScanNode)
-
+main = ScanNode.run
 
 if __name__ == "__main__":
     main()
