@@ -14,6 +14,7 @@ from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import ClockLostError
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchServer, PlantChild
+from tactile_resonance.nodes.ideal_contact import IdealContact
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
 from tactile_resonance.nodes.parameters import Fixed, Parameter, file_of, values
@@ -105,7 +106,11 @@ class FakeHardwareNode(ManagedNode):
         elif server:
             self.resources.callback(BenchServer(server).close)
         self._now_ns = BenchNow(self, server)
-        self._touch = SimulatedTip(self, self._bench, read, plant, self._now_ns, self._stop)
+        self._touch = SimulatedTip(self, self._bench, read, plant, self._now_ns)
+        if plant is None and self._stop is None:
+            self._touch.follow_poses()
+        elif plant is None:
+            IdealContact(self, self._touch, self._stop)
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
         self.serve(Play, "bench/play", self._on_play)
         self.serve_trigger("bench/stop", self._silence)
