@@ -143,16 +143,14 @@ class BenchNow:
     Parameters
     ----------
     node : ManagedNode
-        Publishes simulated time on `/clock` until it is cleaned up.
-    address : str
-        ``HOST:PORT`` of simulated time; empty: the machine's time.
+        Publishes simulated time on `/clock` until it is cleaned up, where it lives in that.
     """
 
-    def __init__(self, node: ManagedNode, address: str) -> None:
+    def __init__(self, node: ManagedNode) -> None:
         self._clock: SimulatedClock | None = None
         self._lock = threading.Lock()
-        if address:
-            self._clock = SimulatedClock(address, node.get_name())
+        if node.time_server:
+            self._clock = SimulatedClock(node.time_server, node.get_name())
             node.resources.callback(self._clock.close)
             self._publisher = node.publish_on(Clock, "/clock", 1)
             node.every(CLOCK_S, self._publish)

@@ -81,20 +81,18 @@ class ContactNode(ManagedNode):
         self._arm: NodeArm | None = None
         self._stop = StopInput(self)
         self._stop.draw_back = self._draw_back
-        (stalls_s,) = values(self, "simulated_stalls_s")
-        self._settings = ContactSettings(self, stalls_s, self._require_allowed, self._take)
+        self._settings = ContactSettings(self, self._require_allowed, self._take)
 
     def configure(self) -> None:
         """Connect arm and force source."""
-        names = ("frame_id", "base_frame", "publish_rate_hz")
-        frame_id, self._base_frame, rate_hz = values(self, *names)
-        self._topics = ContactTopics(self, self._stop, frame_id, self._base_frame, rate_hz)
+        names = ("frame_id", "base_frame", "sensor_frame", "tool_frame")
+        frame_id, self._base_frame, sensor_frame, tool_frame = values(self, *names)
+        self._topics = ContactTopics(self, self._stop)
         self._priority = contact_devices.take_realtime(self)
         self._arm = contact_devices.make_arm(self, self._priority)
         self._settings.read()
         self.resources.callback(self._arm.close)
         self._tip = contact_devices.tip_geometry(self)
-        sensor_frame, tool_frame = values(self, "sensor_frame", "tool_frame")
         flange = Pose.at_origin().seen_from(self._arm.tip_in_tool)
         broadcast_fixed(self, frame_id, {sensor_frame: self._tip.sensor, tool_frame: flange})
         self._arm.connect()

@@ -22,7 +22,7 @@ from tactile_resonance.contact.parameters import (
     read_contact,
 )
 from tactile_resonance.fields import numbers, require
-from tactile_resonance.nodes.parameters import Fixed, Parameter
+from tactile_resonance.nodes.parameters import Fixed, Parameter, values
 
 _GROUPS = {"contact": ContactParameters, "limits": Limits}
 _LOW, _HIGH = "limits.workspace.low_m", "limits.workspace.high_m"
@@ -52,9 +52,7 @@ class ContactSettings:
     Parameters
     ----------
     node : Node
-        Just made, with `contact_parameters` declared.
-    longer_s : float
-        By which robot and force source may be silent for longer than the limits say.
+        Just made, with `contact_parameters` and ``simulated_stalls_s`` declared.
     require_allowed : callable
         Raises ``ValueError`` where the arm's driver would refuse what they allow.
     take : callable
@@ -69,11 +67,10 @@ class ContactSettings:
     def __init__(
         self,
         node: Node,
-        longer_s: float,
         require_allowed: Callable[[ContactParameters, Limits], None],
         take: Callable[[ContactParameters, Limits], None],
     ) -> None:
-        self._node, self._longer_s = node, longer_s
+        self._node = node
         self._require_allowed, self._take = require_allowed, take
         names = [p.name for p in contact_parameters() if _last(p.name) in _AT_MOST | _AT_LEAST]
         self._launched = {name: node.get_parameter(name).value for name in names}
@@ -85,11 +82,9 @@ class ContactSettings:
 
     def _read(self, **changed: Any) -> tuple[ContactParameters, Limits]:
         parameters, limits = read_parameters(self._node, **changed)
-        limits = replace(
-            limits,
-            force_age_s=limits.force_age_s + self._longer_s,
-            arm_age_s=limits.arm_age_s + self._longer_s,
-        )
+        (longer_s,) = values(self._node, "simulated_stalls_s")
+        ages_s = {name: getattr(limits, name) + longer_s for name in ("force_age_s", "arm_age_s")}
+        limits = replace(limits, **ages_s)
         self._require_allowed(parameters, limits)
         return parameters, limits
 

@@ -105,7 +105,7 @@ class FakeHardwareNode(ManagedNode):
             self.resources.callback(plant.close)
         elif server:
             self.resources.callback(BenchServer(server).close)
-        self._now_ns = BenchNow(self, server)
+        self._now_ns = BenchNow(self)
         self._touch = SimulatedTip(self, self._bench, read, plant, self._now_ns)
         if plant is None and self._stop is None:
             self._touch.follow_poses()

@@ -103,9 +103,8 @@ class OneGoal:
     Parameters
     ----------
     node : ManagedNode
-        Whose actions and service they are, until it is cleaned up.
-    rejection : str
-        Name of the service that has the reason: rclpy has no place for it in its answer to a goal.
+        Whose actions they are, until it is cleaned up, and whose service ``scan/rejection`` has the reason:
+        rclpy has no place for it in its answer to a goal.
     around : callable
         Context of the work, entered and left in the executor's thread.
 
@@ -118,13 +117,13 @@ class OneGoal:
     """
 
     def __init__(
-        self, node: ManagedNode, rejection: str, around: Callable[[], AbstractContextManager[None]]
+        self, node: ManagedNode, around: Callable[[], AbstractContextManager[None]]
     ) -> None:
         self._node, self._around = node, around
         self.handle: ServerGoalHandle | None = None
         self.controls: Controls | None = None
         self._asked = self._rejection = ""
-        node.serve(Trigger, rejection, self._on_rejection)
+        node.serve(Trigger, "scan/rejection", self._on_rejection)
 
     def act(
         self,
@@ -237,7 +236,7 @@ class ScanNode(ManagedNode):
         self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
         self._run_directory = ""
         self._told: tuple[Phase, str, float] | None = None
-        goals = self._goals = OneGoal(self, "scan/rejection", self._hands.listening)
+        goals = self._goals = OneGoal(self, self._hands.listening)
         for name, ask in CONTROLS.items():
             goals.serve_control(name, ask)
         done, busy = Scan.Result.COMPLETE, Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
