@@ -72,9 +72,9 @@ CONTACT_FIGURES = (
 RosTime = Callable[[int], int]
 """From a time of the loop's clock [ns] to ROS time [ns]."""
 
-_HOLDS = {
-    MakeContact.Goal.HOLD_FORCE: HoldMode.FORCE,
-    MakeContact.Goal.HOLD_INDENTATION: HoldMode.INDENTATION,
+HOLDS = {
+    HoldMode.FORCE: MakeContact.Goal.HOLD_FORCE,
+    HoldMode.INDENTATION: MakeContact.Goal.HOLD_INDENTATION,
 }
 
 
@@ -210,11 +210,9 @@ def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: floa
     ValueError
         If its frame is not that of the base, the way to hold is unknown, or orientation or normal is invalid.
     """
-    if request.hold not in _HOLDS:
-        raise ValueError(f"hold: {request.hold}, accepted are {sorted(_HOLDS)}")
+    hold = key_of(HOLDS, request.hold, "hold")
     touch = touch_of(request, base_frame, ball_radius_m)
-    standoff_m = request.standoff_m or math.inf
-    return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]), standoff_m)
+    return ContactGoal(touch, Aim(request.force_n, hold), request.standoff_m or math.inf)
 
 
 def touch_of(

@@ -13,6 +13,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 import rclpy
 from rclpy.serialization import serialize_message
+from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.cli import main
@@ -182,6 +183,8 @@ def test_analyze_takes_a_point_of_a_run(run, tmp_path, capsys):
 def test_numbers_of_the_core_are_the_constants_of_the_messages():
     for grid, number in messages.GRIDS.items():
         assert number == getattr(msg.Excitation, f"GRID_{grid.name}")
+        asked = getattr(Measure.Goal, f"GRID_{grid.name}", 0)  # 0: the node's parameter
+        assert asked == number
     for kind, number in messages.INPUT_KINDS.items():
         assert number == getattr(msg.Record, f"INPUT_{kind.name}")
     for between, number in messages.BETWEEN_SAMPLES.items():
