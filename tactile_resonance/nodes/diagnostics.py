@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -35,21 +34,11 @@ class Health:
     Parameters
     ----------
     node : Node
-    state : callable
-        Name of the node's lifecycle state.
-    details : callable
-        Further figures of the node by name.
+        With methods ``state_name``, and ``details`` for further figures by name.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        state: Callable[[], str],
-        details: Callable[[], Mapping[str, str]],
-    ) -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
-        self._state = state
-        self._details = details
         self._flows: dict[str, _Flow] = {}
         self._error = ""
         self._error_s = float("-inf")
@@ -84,8 +73,7 @@ class Health:
         return reason
 
     def _publish(self) -> None:
-        now_s = time.monotonic()
-        state = self._state()
+        now_s, state = time.monotonic(), self._node.state_name()
         recent = now_s - self._error_s < ERROR_REMEMBERED_S
         level, message = DiagnosticStatus.OK, state
         if recent:
@@ -105,7 +93,7 @@ class Health:
         if self._error:
             values["last error"] = self._error
             values["last error: age [s]"] = f"{now_s - self._error_s:.3g}"
-        values.update(self._details())
+        values.update(self._node.details())
         self._reported_s = now_s
         name = self._node.get_fully_qualified_name()
         status = DiagnosticStatus(

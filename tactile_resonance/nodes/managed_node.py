@@ -83,7 +83,7 @@ class ManagedNode(LifecycleNode):
             if service.srv_type is ChangeState:
                 service.callback = partial(self._change_state, service.callback)
         declare(self, parameters)
-        self.health = Health(self, self.state_name, self.details)
+        self.health = Health(self)
         self.instance = int.from_bytes(os.urandom(7), "big")
         # started by the first subscriber: each call wakes the executor: most of the cost of an idle node
         self._beat_timer = self.steady_timer(BEAT_S, self._beat)
