@@ -129,7 +129,7 @@ class ContactNode(ManagedNode):
             (MakeContact, "make_contact", self._on_goal),
             (Indent, "indent", self._on_indent),
         ):
-            self.act(kind, name, serve, lambda _: self._news.trigger(), self._refusal)
+            self.act(kind, name, serve, lambda _: self._news.trigger(), self._refuses)
 
     def activate(self) -> None:
         """Start the loop."""
@@ -191,13 +191,9 @@ class ContactNode(ManagedNode):
         if self._thread is not None:
             self._thread.configure(parameters, limits)
 
-    def _refusal(self, _: MakeContact.Goal) -> str:
+    def _refuses(self, _: MakeContact.Goal) -> bool:
         """Goals are taken one at a time, while both devices are well and the tip is not stopped."""
-        if self._goal is not None:
-            return "a contact is under way"
-        if self._stop.stopped:
-            return "the tip is stopped"
-        return "" if self._fault is None else str(self._fault)
+        return self._stop.stopped or self._goal is not None or self._fault is not None
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
         def read() -> tuple[ContactGoal, None]:

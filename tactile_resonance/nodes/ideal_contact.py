@@ -79,7 +79,7 @@ class IdealContact:
             "make_contact",
             self._on_goal,
             on_cancel=lambda _: self.draw_back(),
-            refusal=lambda _: "the tip is stopped" if stop.stopped else "",
+            refuses=lambda _: stop.stopped,
         )
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:

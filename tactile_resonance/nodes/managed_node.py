@@ -190,16 +190,16 @@ class ManagedNode(LifecycleNode):
         name: str,
         callback: Callable[[ServerGoalHandle], Awaitable[Any]],
         on_cancel: Callable[[ServerGoalHandle], None] = lambda _: None,
-        refusal: Callable[[Any], str | Awaitable[str]] = lambda _: "",
+        refuses: Callable[[Any], bool | Awaitable[bool]] = lambda _: False,
     ) -> None:
         """Action until the node is cleaned up.
 
-        Goals are accepted while the node is active, unless `refusal`, which may wait, has a reason
-        against them. A request to cancel is always accepted; the callback ends the goal.
+        Goals are accepted while the node is active, unless `refuses`, which may wait, is true of them. A
+        request to cancel is always accepted; the callback ends the goal.
         """
 
         async def on_request(goal: Any) -> GoalResponse:
-            accepted = self.active and not await await_or_execute(refusal, goal) and self.active
+            accepted = self.active and not await await_or_execute(refuses, goal) and self.active
             return GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
 
         def on_cancel_request(goal: ServerGoalHandle) -> CancelResponse:

@@ -151,7 +151,7 @@ class OneGoal:
         """
         found: dict[int, Any] = {}  # by the check of a goal, by its message
 
-        async def refusal(message: Any) -> str:
+        async def refuses(message: Any) -> bool:
             self._asked = asked = str(message)
             reason = ""
             try:
@@ -164,7 +164,7 @@ class OneGoal:
                 self._node.get_logger().warning(f"goal rejected: {reason}")
             if self._asked == asked:  # no other came while this one was checked
                 self._rejection = reason
-            return reason
+            return bool(reason)
 
         async def serve(goal: ServerGoalHandle) -> Any:
             checked = found.pop(id(goal.request))
@@ -182,7 +182,7 @@ class OneGoal:
             end_goal(goal, result.outcome == done)
             return result
 
-        self._node.act(kind, name, serve, lambda _: self.cancel(), refusal)
+        self._node.act(kind, name, serve, lambda _: self.cancel(), refuses)
 
     def serve_control(self, name: str, ask: Callable[[Controls], None]) -> None:
         """Service that asks something of the goal that is worked at."""
