@@ -139,19 +139,14 @@ def require_arm_allows(
     config: CommandLimits, parameters: ContactParameters, limits: Limits
 ) -> None:
     """Raise ``ValueError`` where the arm's driver would refuse what the controller may command."""
-    speed, turn, acceleration = (
-        ("max_speed_m_s", config.max_speed_m_s),
-        ("max_turn_rad_s", config.max_turn_rad_s),
-        ("max_acceleration_m_s2", config.max_acceleration_m_s2),
-    )
-    for owner, name, (field, most) in (
-        (limits, "free_speed_m_s", speed),
-        (limits, "angular_speed_rad_s", turn),
-        (limits, "stop_deceleration_m_s2", acceleration),
-        (parameters, "acceleration_m_s2", acceleration),
-        (parameters, "relief_acceleration_m_s2", acceleration),
+    for owner, name, field in (
+        (limits, "free_speed_m_s", "max_speed_m_s"),
+        (limits, "angular_speed_rad_s", "max_turn_rad_s"),
+        (limits, "stop_deceleration_m_s2", "max_acceleration_m_s2"),
+        (parameters, "acceleration_m_s2", "max_acceleration_m_s2"),
+        (parameters, "relief_acceleration_m_s2", "max_acceleration_m_s2"),
     ):
-        value = getattr(owner, name)
+        value, most = getattr(owner, name), getattr(config, field)
         require(value <= most, name, value, f"at most {field} = {most:g} of robot_config")
     if isinstance(config, TwistConfig):
         least = (1 - 1e-9) / config.rate_hz

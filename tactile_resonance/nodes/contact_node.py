@@ -166,7 +166,7 @@ class ContactNode(ManagedNode):
 
     def waiting_for(self) -> str:
         """What keeps simulated time from going on."""
-        return "" if self._thread is None else self._thread.waits_for
+        return "" if self._thread is None else self._arm.waits_for
 
     def details(self) -> dict[str, str]:
         """Loop and devices."""
@@ -319,8 +319,6 @@ class ContactNode(ManagedNode):
 
     def _on_poles(self, message: msg.Poles) -> None:
         thread = self._thread
-        if thread is None:
-            return
         now_ns = thread.clock.ros_ns(thread.clock.now_ns())
         try:
             touched = self._touch.hear(message, thread.controller.state, now_ns)
