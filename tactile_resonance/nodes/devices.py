@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import queue
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -165,8 +164,8 @@ def open_store(folder: str, device: str) -> RecordStore | None:
             return RecordStore(path)
 
 
-class BenchDevice:
-    """Keeps the contract of `AcquisitionDevice`; called from a thread other than the executor's.
+class BenchDevice(AcquisitionDevice):
+    """The simulated bench; called from a thread other than the executor's.
 
     In simulated time it lets time go on to the end of each block, where a conductor's `go` ends.
     """
@@ -185,10 +184,6 @@ class BenchDevice:
         self._answer_s = node.hung_after_s if node.time_server else ANSWER_TIMEOUT_S
         topic = "bench/block"
         self._heard = node.create_subscription(msg.Record, topic, self._blocks.put, RESULTS)
-
-    def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
-        """The bench plays what is asked."""
-        return list(excitations)
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
         """Wait for the bench."""
