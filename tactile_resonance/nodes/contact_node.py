@@ -81,7 +81,7 @@ class ContactNode(ManagedNode):
         self._arm: NodeArm | None = None
         self._stop = StopInput(self)
         self._stop.draw_back = self._draw_back
-        self._settings = ContactSettings(self, self._require_allowed, self._take)
+        self._settings = ContactSettings(self, self._take)
 
     def configure(self) -> None:
         """Connect arm and force source."""
@@ -183,11 +183,9 @@ class ContactNode(ManagedNode):
 
     # requests, in the executor's thread
 
-    def _require_allowed(self, parameters: ContactParameters, limits: Limits) -> None:
+    def _take(self, parameters: ContactParameters, limits: Limits) -> None:
         if self._arm is not None:
             contact_devices.require_arm_allows(self._arm.config, parameters, limits)
-
-    def _take(self, parameters: ContactParameters, limits: Limits) -> None:
         if self._thread is not None:
             self._thread.configure(parameters, limits)
 

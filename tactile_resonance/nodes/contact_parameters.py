@@ -53,10 +53,8 @@ class ContactSettings:
     ----------
     node : Node
         Just made, with `contact_parameters` and ``simulated_stalls_s`` declared.
-    require_allowed : callable
-        Raises ``ValueError`` where the arm's driver would refuse what they allow.
     take : callable
-        Receives what is new; raises ``ValueError`` where it cannot be taken now.
+        Receives what is new; raises ``ValueError`` where arm or loop cannot take it.
 
     Attributes
     ----------
@@ -64,29 +62,20 @@ class ContactSettings:
         As `read` last.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        require_allowed: Callable[[ContactParameters, Limits], None],
-        take: Callable[[ContactParameters, Limits], None],
-    ) -> None:
-        self._node = node
-        self._require_allowed, self._take = require_allowed, take
+    def __init__(self, node: Node, take: Callable[[ContactParameters, Limits], None]) -> None:
+        self._node, self._take = node, take
         names = [p.name for p in contact_parameters() if _last(p.name) in _AT_MOST | _AT_LEAST]
         self._launched = {name: node.get_parameter(name).value for name in names}
         node.add_on_set_parameters_callback(self._on_change)
 
-    def read(self) -> None:
-        """Read all; ``ValueError`` where one is not accepted."""
-        self.parameters, self.limits = self._read()
-
-    def _read(self, **changed: Any) -> tuple[ContactParameters, Limits]:
+    def read(self, **changed: Any) -> None:
+        """Read all, as `read_parameters` does; ``ValueError`` where one is not accepted."""
         parameters, limits = read_parameters(self._node, **changed)
         (longer_s,) = values(self._node, "simulated_stalls_s")
         ages_s = {name: getattr(limits, name) + longer_s for name in ("force_age_s", "arm_age_s")}
         limits = replace(limits, **ages_s)
-        self._require_allowed(parameters, limits)
-        return parameters, limits
+        self._take(parameters, limits)
+        self.parameters, self.limits = parameters, limits
 
     def _on_change(self, changes: Sequence) -> SetParametersResult:
         """Take what is in range, and of limits what is stricter than the launch's."""
@@ -95,11 +84,9 @@ class ContactSettings:
             return SetParametersResult(successful=True)
         try:
             self._require_stricter(changed)
-            new = self._read(**changed)
-            self._take(*new)
+            self.read(**changed)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self.parameters, self.limits = new
         return SetParametersResult(successful=True)
 
     def _require_stricter(self, changed: Mapping[str, Any]) -> None:
