@@ -69,8 +69,25 @@ class ContactSettings:
         node.add_on_set_parameters_callback(self._on_change)
 
     def read(self, **changed: Any) -> None:
-        """Read all, as `read_parameters` does; ``ValueError`` where one is not accepted."""
-        parameters, limits = read_parameters(self._node, **changed)
+        """Read all, some with values about to be set (``**{"contact.x": 1}``).
+
+        Raises
+        ------
+        ValueError
+            If a value is out of range or beyond the limits.
+        """
+
+        def value(full: str) -> Any:
+            return changed.get(full, self._node.get_parameter(full).value)
+
+        read = []
+        for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
+            given = {name: value(f"{group}.{name}") for name in ranges_of(kind)}
+            read.append(replace(defaults, **given))
+        parameters, limits = read
+        corners = (numbers(list(value(full)), full, 3) for full in (_LOW, _HIGH))
+        limits = replace(limits, workspace=Workspace(*corners))
+        limits.check(parameters)
         (longer_s,) = values(self._node, "simulated_stalls_s")
         ages_s = {name: getattr(limits, name) + longer_s for name in ("force_age_s", "arm_age_s")}
         limits = replace(limits, **ages_s)
@@ -102,29 +119,6 @@ class ContactSettings:
             )
             accepted += "made stricter here, and laxer by a new launch only"
             require(bool(np.all(stricter)), name, value.tolist(), accepted)
-
-
-def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limits]:
-    """Parameters and limits of a node, some with values about to be set (``**{"contact.x": 1}``).
-
-    Raises
-    ------
-    ValueError
-        If a value is out of range or beyond the limits.
-    """
-
-    def value(full: str) -> Any:
-        return changed.get(full, node.get_parameter(full).value)
-
-    read = []
-    for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
-        given = {name: value(f"{group}.{name}") for name in ranges_of(kind)}
-        read.append(replace(defaults, **given))
-    parameters, limits = read
-    corners = (numbers(list(value(full)), full, 3) for full in (_LOW, _HIGH))
-    limits = replace(limits, workspace=Workspace(*corners))
-    limits.check(parameters)
-    return parameters, limits
 
 
 def _last(name: str) -> str:

@@ -24,7 +24,6 @@ from tactile_resonance.contact.parameters import (
     read_contact,
 )
 from tactile_resonance.nodes import contact_node
-from tactile_resonance.nodes.contact_parameters import read_parameters
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 
@@ -107,8 +106,8 @@ def test_several_limits_at_once_are_refused_for_the_one_that_is_laxer(launch):
 
 def test_the_workspace_of_a_launch_is_made_smaller_and_never_larger(launch):
     node = launch(workspace__low_m="[-0.3, -0.2, 0.0]", workspace__high_m="[0.3, 0.2, 0.5]")
-    _, limits = read_parameters(node)
-    assert limits.workspace == Workspace((-0.3, -0.2, 0.0), (0.3, 0.2, 0.5))
+    node._settings.read()
+    assert node._settings.limits.workspace == Workspace((-0.3, -0.2, 0.0), (0.3, 0.2, 0.5))
     reason = ask(node, workspace__high_m=[0.3, 0.2, 0.6])
     assert "limits.workspace.high_m: got [0.3, 0.2, 0.6]; accepted is at most [0.3, 0.2" in reason
     assert "accepted is at least" in ask(node, workspace__low_m=[-0.3, -0.21, 0.0])

@@ -18,7 +18,6 @@ from rclpy.node import Node
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.nodes import scan_hands
 from tactile_resonance.nodes.contact_node import ContactNode
-from tactile_resonance.nodes.contact_parameters import read_parameters
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import poles_to_message
@@ -214,14 +213,15 @@ def ask(monkeypatch):
 
 def test_figures_are_those_of_contact_node(ask):
     use, node = ask(ContactNode)
-    parameters, limits = read_parameters(node)
+    settings = node._settings
+    settings.read()
     assert use.tip == TipGeometry(beam_tilt_rad=0.2)
     assert use.limits.depth_m == 3.5e-3
     assert use.parameters.standoff_m == 4e-3
     for name in scan_hands.TIP_LIMITS:
-        assert getattr(use.limits, name) == getattr(limits, name)
+        assert getattr(use.limits, name) == getattr(settings.limits, name)
     for name in scan_hands.TIP_PARAMETERS:
-        assert getattr(use.parameters, name) == getattr(parameters, name)
+        assert getattr(use.parameters, name) == getattr(settings.parameters, name)
 
 
 @pytest.mark.parametrize("name", ["contact_node", "another"])
