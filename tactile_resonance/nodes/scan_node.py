@@ -225,12 +225,11 @@ class ScanNode(ManagedNode):
 
     def configure(self) -> None:
         """Offer the actions; the topics are subscribed to when a scan begins."""
-        names = ("contact", "table_in_base", "table_frame", "base_frame")
-        contact, table, table_frame, base_frame = values(self, *names)
+        names = ("table_in_base", "table_frame", "base_frame")
+        table, table_frame, base_frame = values(self, *names)
         self._frames = Frames(table_frame, base_frame, pose_of(table, "table_in_base"))
         self._time = ScanTime(self.time_server, self.hung_after_s)
-        robot = contact == "robot"
-        self._hands = NodeHands(self, base_frame, robot, self._time, self._tell_waiting)
+        self._hands = NodeHands(self, self._time, self._tell_waiting)
         broadcast_fixed(self, base_frame, {table_frame: self._frames.table_in_base})
         self._files = GoalFiles(*values(self, "run_folder", "goal_folders"))
         self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)

@@ -21,6 +21,7 @@ from tactile_resonance.nodes.contact_node import ContactNode
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import poles_to_message
+from tactile_resonance.nodes.parameters import Fixed
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_time import ScanTime
@@ -36,15 +37,15 @@ from tactile_resonance.scan.surface import Plane
 from test.spinning import spin_until
 
 PLACE_M = (0.004, -0.003, 0.0)
+BASE = Fixed("base_frame", "base", ".")
 
 
 class Scanning(ManagedNode):
     def __init__(self):
-        super().__init__("scan_node", ())
+        super().__init__("scan_node", (Fixed("contact", "none", "."), BASE))
 
     def configure(self):
-        scan_time = ScanTime("", 60.0)
-        self.hands = NodeHands(self, "base", False, scan_time, lambda _: None)
+        self.hands = NodeHands(self, ScanTime("", 60.0), lambda _: None)
 
 
 @pytest.fixture
@@ -181,10 +182,10 @@ GIVEN_AS = ["--ros-args", *(word for k, v in GIVEN.items() for word in ("-p", f"
 
 class Asker(ManagedNode):
     def __init__(self):
-        super().__init__("scan_node", ())
+        super().__init__("scan_node", (Fixed("contact", "robot", "."), BASE))
 
     def configure(self):
-        self.hands = scan_hands.NodeHands(self, "base", True, ScanTime("", 60.0), print)
+        self.hands = NodeHands(self, ScanTime("", 60.0), print)
 
 
 @pytest.fixture
