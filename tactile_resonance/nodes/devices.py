@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import queue
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,8 +71,8 @@ PARAMETERS = (
 ANSWER_TIMEOUT_S = 10.0
 
 
-def make_device(node: ManagedNode) -> AcquisitionDevice:
-    """The device that the node's parameters name.
+def make_device(node: ManagedNode) -> tuple[AcquisitionDevice, Sequence[bytes]]:
+    """The device that the node's parameters name, and serialised point results of a run that it plays again.
 
     Raises
     ------
@@ -84,7 +85,7 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
         node, "device", "device_config", "replay_speed", "frame_id"
     )
     if device == "bench":
-        return BenchDevice(node, frame_id)
+        return BenchDevice(node, frame_id), ()
     if not config:
         raise ValueError(f"device_config: empty, expected a path for the device {device}")
     path = Path(config).expanduser().absolute()
@@ -92,38 +93,24 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
         # only here: it takes a node a tenth of a second more to start
         from tactile_resonance.drivers.replay import ReplayDevice
 
-        return ReplayDevice(path, speed, _entries_of(path))
-    return NiDaqDevice(read_nidaq_config(path))
+        entries, results = _content_of(path)
+        return ReplayDevice(path, speed, entries), results
+    return NiDaqDevice(read_nidaq_config(path)), ()
 
 
-def replayed_results(node: ManagedNode) -> tuple[bytes, ...]:
-    """Serialised point results of the run that is played again; of any other device none."""
-    device, config = values(node, "device", "device_config")
-    path = Path(config).expanduser().absolute()
-    if device != "replay" or not _is_run(path):
-        return ()
-    from tactile_resonance.scan.recorded import recorded_results
-    from tactile_resonance.scan.run_content import read_run
-
-    return tuple(recorded_results(read_run(path)))
-
-
-def _is_run(path: Path) -> bool:
-    return (path / "run.json").is_file()
-
-
-def _entries_of(path: Path) -> list[StoredEntry] | None:
-    """The measurements of a scan's run; None for a folder that the device reads without them."""
-    if not _is_run(path):
-        return None
+def _content_of(path: Path) -> tuple[list[StoredEntry] | None, Sequence[bytes]]:
+    """Measurements and point results of a scan's run; None for a folder that the device reads itself."""
+    if not (path / "run.json").is_file():
+        return None, ()
     try:
         # only here: everything else works without the library for recordings
-        from tactile_resonance.scan.recorded import run_entries
+        from tactile_resonance.scan.recorded import recorded_results, run_entries
+        from tactile_resonance.scan.run_content import read_run
     except ImportError as error:
         raise ValueError(
             f"device: replay of a run: {error.name} not found; pip install rosbags"
         ) from error
-    return run_entries(path)
+    return run_entries(path), tuple(recorded_results(read_run(path)))
 
 
 def open_store(folder: str, device: str) -> RecordStore | None:

@@ -13,12 +13,7 @@ from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.drivers.acquisition import (
-    AcquiredBlock,
-    AcquisitionDevice,
-    DeviceError,
-    DeviceInfo,
-)
+from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.fields import counted
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import contact_source, devices, excitation_design
@@ -76,9 +71,8 @@ class ExcitationNode(ManagedNode):
         (self._frame_id,) = values(self, "frame_id")
         self._excitations = self.publish_on(msg.Excitation, "excitation", EXCITATIONS)
         self._records = self.publish_on(msg.Record, "record", RESULTS)
-        self._device: AcquisitionDevice = devices.make_device(self)
+        self._device, self._replayed = devices.make_device(self)
         self.resources.callback(self._device.close)
-        self._replayed = devices.replayed_results(self)
         if self._replayed:
             self._results = self.publish_on(msg.PointResult, "point_result", POINT_RESULTS)
         elif not values(self, "keep_all_records")[0]:

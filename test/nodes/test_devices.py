@@ -31,7 +31,7 @@ def make():
         node = rclpy.create_node("owner", parameter_overrides=given)
         declare(node, devices.PARAMETERS)
         try:
-            return devices.make_device(node)
+            return devices.make_device(node)[0]
         finally:
             node.destroy_node()
 
@@ -58,7 +58,7 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
         def close(self):
             closed.append(True)
 
-    monkeypatch.setattr(devices, "make_device", lambda _: Device())
+    monkeypatch.setattr(devices, "make_device", lambda _: (Device(), ()))
     with initialised(domain_id=free_domain_id(os.environ)):
         node = ExcitationNode()
         node.trigger_configure()

@@ -131,7 +131,7 @@ def test_a_replay_plays_the_run_again_bit_by_bit(run):
     with initialised(args=["--ros-args", *arguments], domain_id=free_domain_id(os.environ)):
         node = rclpy.create_node("replay_test")
         declare(node, PARAMETERS)
-        device = make_device(node)
+        device, _ = make_device(node)
         node.destroy_node()
     for key in (13, 11, 12):  # in the order in which they were taken
         excitation, records = measurement(key)
