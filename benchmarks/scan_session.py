@@ -135,7 +135,7 @@ class ScanSession(NodeClient):
         self._place(position_m)
         truth = self._truth
         contact = self.truth(here=True)
-        future = self.begin(self._measure, goal, timeout_s, self._on_feedback).get_result_async()
+        future = self.begin(self._measure, goal, self._on_feedback).get_result_async()
         self.wait(future.done, timeout_s, "the measurement")
         answer = future.result()
         if answer.result.outcome != Measure.Result.DONE:

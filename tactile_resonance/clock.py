@@ -69,12 +69,9 @@ class ClockLostError(ConnectionError):
 
 
 class Clock(Protocol):
-    """A clock that never goes back."""
+    """A clock that never goes back: of a simulated bench, whose time is ROS time, unless it says otherwise."""
 
-    @property
-    def simulated(self) -> bool:
-        """Whether it is the clock of a simulated bench."""
-        ...
+    simulated: bool = True
 
     def now_ns(self) -> int:
         """Time now [ns]."""
@@ -86,11 +83,11 @@ class Clock(Protocol):
 
     def ros_ns(self, time_ns: int) -> int:
         """A time of this clock as ROS time: since 1970, or of the simulation [ns]."""
-        ...
+        return time_ns
 
     def own_ns(self, ros_ns: int) -> int:
         """A ROS time as one of this clock [ns]."""
-        ...
+        return ros_ns
 
 
 class WallClock:
@@ -120,21 +117,7 @@ class WallClock:
         return ros_ns - self._ros_ahead_ns
 
 
-class OfRosTime:
-    """What clocks of simulated time share: it is ROS time."""
-
-    simulated = True
-
-    def ros_ns(self, time_ns: int) -> int:
-        """The same: simulated time is ROS time."""
-        return time_ns
-
-    def own_ns(self, ros_ns: int) -> int:
-        """The same."""
-        return ros_ns
-
-
-class SimulatedClock(OfRosTime):
+class SimulatedClock(Clock):
     """Takes part in the time of a bench; for one thread, except `now_ns`, which any thread may call.
 
     Parameters

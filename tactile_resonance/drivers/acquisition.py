@@ -83,7 +83,7 @@ class AcquisitionDevice(Protocol):
         measurement, or the one named by a measurement id other than 0. Ids that are 0 in the answer
         are for the caller to give.
         """
-        ...
+        return list(excitations)
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
         """Set the sample clock; say what the device is."""
@@ -102,8 +102,7 @@ class AcquisitionDevice(Protocol):
         ...
 
     def interrupt(self) -> None:
-        """Let a `read_block` that waits raise soon, where that can be done; from any thread."""
-        ...
+        """Let a `read_block` that waits raise soon, where that can be done; from any thread. Else nothing."""
 
     def stop(self) -> None:
         """Output to zero, inputs off; harmless when nothing plays."""

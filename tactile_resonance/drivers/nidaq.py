@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from types import ModuleType
 from typing import Any
@@ -18,7 +18,12 @@ from typing import Any
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
+from tactile_resonance.drivers.acquisition import (
+    AcquiredBlock,
+    AcquisitionDevice,
+    DeviceError,
+    DeviceInfo,
+)
 from tactile_resonance.drivers.nidaq_config import TERMINALS, InputChannel, NiDaqConfig
 from tactile_resonance.drivers.nidaq_scale import CountScale
 from tactile_resonance.fields import one_line
@@ -38,8 +43,8 @@ _OVERRUN = {
 }
 
 
-class NiDaqDevice:
-    """Keeps `AcquisitionDevice`.
+class NiDaqDevice(AcquisitionDevice):
+    """A device of NI.
 
     The inputs make the sample clock; the output runs on it and starts with the inputs' start
     trigger, one period repeated from the buffer. Every period is read whole and in order: a reader
@@ -80,10 +85,6 @@ class NiDaqDevice:
         self._index = 0
         self._start_ns = 0
         self._closed = False
-
-    def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
-        """What was asked."""
-        return list(excitations)
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
         """Check devices, ranges and rate by setting up the inputs once; nothing moves."""
@@ -165,9 +166,6 @@ class NiDaqDevice:
                 self._output.start()
                 self._input.start()
                 self._start_ns = time.time_ns()
-
-    def interrupt(self) -> None:
-        """Nothing: the library's call ends with its block."""
 
     def read_block(self, timeout_s: float) -> AcquiredBlock:
         """The next period, whole; on any error the output is set to 0 V first."""

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from tactile_resonance.clock import Demand, OfRosTime, SimulatedClock
+from tactile_resonance.clock import Clock, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, Cell
 from tactile_resonance.drivers.ur_client_process import ClientProcess
 from tactile_resonance.drivers.ur_exchange import NOTHING, UrCommand
@@ -33,7 +33,7 @@ def client_name() -> str:
     return f"client of the arm, process {os.getpid()}"
 
 
-class AskedClock(OfRosTime):
+class AskedClock(Clock):
     """Simulated time that is asked for whenever it is needed."""
 
     def __init__(self, clock: SimulatedClock) -> None:
@@ -49,7 +49,7 @@ class AskedClock(OfRosTime):
             time.sleep(AWAY_S)
 
 
-class LedClock(OfRosTime):
+class LedClock(Clock):
     """A `Clock` that a loop leads: when it returns, the data that arm and cell sent until then have been read.
 
     Parameters

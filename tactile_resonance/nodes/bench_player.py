@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.processes import may_take_priority, start_child
-from tactile_resonance.record import Origin, Record
 from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.plant.defaults import PRIORITY, READY, order
 from tactile_resonance.simulation.ur5e.reactor import Reactor
@@ -145,16 +143,14 @@ class BenchNow:
     Parameters
     ----------
     node : ManagedNode
-        Publishes simulated time on `/clock` until it is cleaned up.
-    address : str
-        ``HOST:PORT`` of simulated time; empty: the machine's time.
+        Publishes simulated time on `/clock` until it is cleaned up, where it lives in that.
     """
 
-    def __init__(self, node: ManagedNode, address: str) -> None:
+    def __init__(self, node: ManagedNode) -> None:
         self._clock: SimulatedClock | None = None
         self._lock = threading.Lock()
-        if address:
-            self._clock = SimulatedClock(address, node.get_name())
+        if node.time_server:
+            self._clock = SimulatedClock(node.time_server, node.get_name())
             node.resources.callback(self._clock.close)
             self._publisher = node.publish_on(Clock, "/clock", 1)
             node.every(CLOCK_S, self._publish)
@@ -242,16 +238,3 @@ class BenchPlayer:
         except ClockLostError:
             return False
         return not self._stop.is_set()
-
-
-def bench_record(block: Record, excitation: Excitation, start_ns: int, frame_id: str) -> Record:
-    """Record of a block of an excitation that began at a ROS time [ns]."""
-    origin = Origin(
-        measurement_id=excitation.measurement_id,
-        excitation_id=excitation.excitation_id,
-        time_ns=start_ns + block.origin.time_ns,
-        frame_id=frame_id,
-        label=excitation.label,
-        simulated=True,
-    )
-    return replace(block, realisation=excitation.realisation, origin=origin)

@@ -104,23 +104,12 @@ class NodeClient(ABC):
         return NoAnswer(f"waited {timeout_s:g} s for {what}{f' ({why})' if why else ''}")
 
     def begin(
-        self,
-        client: ActionClient,
-        goal: Any,
-        timeout_s: float = HANGS_S,
-        feedback: Callable[[Any], None] | None = None,
+        self, client: ActionClient, goal: Any, feedback: Callable[[Any], None] | None = None
     ) -> ClientGoalHandle:
         """Send a goal until it is accepted; one whose answer may be lost is sent again under its id."""
-        deadline = time.monotonic() + timeout_s
-
-        def check() -> None:
-            self._check()
-            if time.monotonic() > deadline:
-                raise NoAnswer(f"waited {timeout_s:g} s for the goal to be accepted")
-
         goals = Goals(client, type(goal).__qualname__, self.spin)
         try:
-            return goals.send(goal, check, lambda: None, feedback)
+            return goals.send(goal, self._check, lambda: None, feedback)
         except (NodeAway, ScanEnded) as error:
             raise NoAnswer(str(error)) from error
 

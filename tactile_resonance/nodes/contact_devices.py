@@ -17,76 +17,63 @@ from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.fields import read_file, read_yaml, require
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, file_of, values
+from tactile_resonance.nodes.parameters import Fixed, file_of, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
 from tactile_resonance.nodes.twist_arm import TwistArm
 from tactile_resonance.processes import may_take_priority, take_priority
 from tactile_resonance.sensor import read_sensor
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "robot_config",
         "config/devices/ur5e.yaml",
         "The arm: a file, absolute or in the package's share folder; its kind is ur or twist.",
-        read_only=True,
     ),
-    Parameter(
-        "robot_host",
-        "",
-        "Name or address of the robot; empty: that of robot_config.",
-        read_only=True,
-    ),
-    Parameter(
+    Fixed("robot_host", "", "Name or address of the robot; empty: that of robot_config."),
+    Fixed(
         "force_config",
         "can_simulated.yaml",
         "The force source: a file of config/force, or an absolute path.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "force_host",
         "",
         "Address of the socketcand server of a cell on CAN; empty: that of force_config.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "realtime_priority",
         20,
         "Priority (SCHED_FIFO) of the control loop and of the robot's client, where the system permits it; "
         "0: none.",
         0,
         99,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "simulated_stalls_s",
         0.0,
         "Of a simulated robot (127.x.y.z) that has no real-time priority: so much longer than hardware robot "
         "and cell may be silent [s].",
         0.0,
         0.2,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "sensor_config",
         "config/sensors/bimorph.yaml",
         "The sensor, for the radius of its tip and the length of its beam.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "beam_tilt_rad",
         0.17,
         "By which the clamp of the beam lies higher than the ball, seen from the surface [rad].",
         0.0,
         1.0,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "housing_below_m",
         0.006,
         "How far the housing reaches below the beam at the clamp [m].",
         0.0,
         0.9,
-        read_only=True,
     ),
 )
 
@@ -152,19 +139,14 @@ def require_arm_allows(
     config: CommandLimits, parameters: ContactParameters, limits: Limits
 ) -> None:
     """Raise ``ValueError`` where the arm's driver would refuse what the controller may command."""
-    speed, turn, acceleration = (
-        ("max_speed_m_s", config.max_speed_m_s),
-        ("max_turn_rad_s", config.max_turn_rad_s),
-        ("max_acceleration_m_s2", config.max_acceleration_m_s2),
-    )
-    for owner, name, (field, most) in (
-        (limits, "free_speed_m_s", speed),
-        (limits, "angular_speed_rad_s", turn),
-        (limits, "stop_deceleration_m_s2", acceleration),
-        (parameters, "acceleration_m_s2", acceleration),
-        (parameters, "relief_acceleration_m_s2", acceleration),
+    for owner, name, field in (
+        (limits, "free_speed_m_s", "max_speed_m_s"),
+        (limits, "angular_speed_rad_s", "max_turn_rad_s"),
+        (limits, "stop_deceleration_m_s2", "max_acceleration_m_s2"),
+        (parameters, "acceleration_m_s2", "max_acceleration_m_s2"),
+        (parameters, "relief_acceleration_m_s2", "max_acceleration_m_s2"),
     ):
-        value = getattr(owner, name)
+        value, most = getattr(owner, name), getattr(config, field)
         require(value <= most, name, value, f"at most {field} = {most:g} of robot_config")
     if isinstance(config, TwistConfig):
         least = (1 - 1e-9) / config.rate_hz

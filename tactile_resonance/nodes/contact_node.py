@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
-from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
@@ -30,46 +28,35 @@ from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
 from tactile_resonance.nodes.indent_conduct import IndentConduct
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode, end_goal, in_thread
 from tactile_resonance.nodes.messages import contact_feedback, contact_goal, contact_result
-from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import POLES, run_node
+from tactile_resonance.nodes.parameters import Fixed, values
+from tactile_resonance.nodes.running import POLES
 from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
 
 PARAMETERS = (
     *contact_devices.PARAMETERS,
     TIME_SERVER,
-    Parameter(
+    Fixed(
         "publish_rate_hz",
         25.0,
         "Rate of pose, wrench and state [Hz], 50 Hz at most while no contact is under way; a change of the "
         "state is published at once. The wrench is the mean since the last one.",
         1.0,
         500.0,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "touch_from_poles",
         False,
         "First contact is detected by poles too, against those in air: the rest of the approach is slow then. "
         "Poles come once a block, so the approach must be slow already: contact.approach_speed_m_s of 2.5e-4 "
         "for blocks of 0.4 s, with limits.approach_s of 20 s or more, and the client has to ask for "
         "measurements of one or two periods all the time.",
-        read_only=True,
     ),
-    Parameter(
-        "touch_false_alarm",
-        1e-6,
-        "Probability of a false alarm of one block [-].",
-        1e-12,
-        0.1,
-        read_only=True,
-    ),
-    Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
-    Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
-    Parameter(
-        "sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball.", read_only=True
-    ),
-    Parameter("tool_frame", "tool", "Frame of the robot's flange or tool.", read_only=True),
+    Fixed("touch_false_alarm", 1e-6, "Probability of a false alarm of one block [-].", 1e-12, 0.1),
+    Fixed("frame_id", "tip", "Frame of the sensor's tip."),
+    Fixed("base_frame", "base", "Frame of the robot's base, of all poses."),
+    Fixed("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball."),
+    Fixed("tool_frame", "tool", "Frame of the robot's flange or tool."),
     BROADCAST_TF,
     *contact_parameters(),
 )
@@ -92,21 +79,20 @@ class ContactNode(ManagedNode):
         super().__init__("contact_node", PARAMETERS)
         self._thread: ContactThread | None = None
         self._arm: NodeArm | None = None
-        self._stop = StopInput(self, self._draw_back)
-        (stalls_s,) = values(self, "simulated_stalls_s")
-        self._settings = ContactSettings(self, stalls_s, self._require_allowed, self._take)
+        self._stop = StopInput(self)
+        self._stop.draw_back = self._draw_back
+        self._settings = ContactSettings(self, self._take)
 
     def configure(self) -> None:
         """Connect arm and force source."""
-        names = ("frame_id", "base_frame", "publish_rate_hz")
-        frame_id, self._base_frame, rate_hz = values(self, *names)
-        self._topics = ContactTopics(self, self._stop, frame_id, self._base_frame, rate_hz)
+        names = ("frame_id", "base_frame", "sensor_frame", "tool_frame")
+        frame_id, self._base_frame, sensor_frame, tool_frame = values(self, *names)
+        self._topics = ContactTopics(self, self._stop)
         self._priority = contact_devices.take_realtime(self)
         self._arm = contact_devices.make_arm(self, self._priority)
         self._settings.read()
         self.resources.callback(self._arm.close)
         self._tip = contact_devices.tip_geometry(self)
-        sensor_frame, tool_frame = values(self, "sensor_frame", "tool_frame")
         flange = Pose.at_origin().seen_from(self._arm.tip_in_tool)
         broadcast_fixed(self, frame_id, {sensor_frame: self._tip.sensor, tool_frame: flange})
         self._arm.connect()
@@ -137,13 +123,13 @@ class ContactNode(ManagedNode):
             began_ns = clock.ros_ns(clock.now_ns())
             self._touch = TouchFromPoles(false_alarm, began_ns)
             self.listen(msg.Poles, "poles", self._on_poles, POLES)
-        self.serve(Trigger, "retract", self._on_retract)
+        self.serve_trigger("retract", self._on_retract)
         self._teller = self.every(FEEDBACK_EVERY_S, self._tell)
         for kind, name, serve in (
             (MakeContact, "make_contact", self._on_goal),
             (Indent, "indent", self._on_indent),
         ):
-            self.act(kind, name, serve, lambda _: self._news.trigger(), self._refusal)
+            self.act(kind, name, serve, lambda _: self._news.trigger(), self._refuses)
 
     def activate(self) -> None:
         """Start the loop."""
@@ -180,7 +166,7 @@ class ContactNode(ManagedNode):
 
     def waiting_for(self) -> str:
         """What keeps simulated time from going on."""
-        return "" if self._thread is None else self._thread.waits_for
+        return "" if self._thread is None else self._arm.waits_for
 
     def details(self) -> dict[str, str]:
         """Loop and devices."""
@@ -197,40 +183,35 @@ class ContactNode(ManagedNode):
 
     # requests, in the executor's thread
 
-    def _require_allowed(self, parameters: ContactParameters, limits: Limits) -> None:
+    def _take(self, parameters: ContactParameters, limits: Limits) -> None:
         if self._arm is not None:
             contact_devices.require_arm_allows(self._arm.config, parameters, limits)
-
-    def _take(self, parameters: ContactParameters, limits: Limits) -> None:
         if self._thread is not None:
             self._thread.configure(parameters, limits)
 
-    def _refusal(self, _: MakeContact.Goal) -> str:
+    def _refuses(self, _: MakeContact.Goal) -> bool:
         """Goals are taken one at a time, while both devices are well and the tip is not stopped."""
-        if self._goal is not None:
-            return "a contact is under way"
-        if self._stop.stopped:
-            return "the tip is stopped"
-        return "" if self._fault is None else str(self._fault)
+        return self._stop.stopped or self._goal is not None or self._fault is not None
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
-        def read() -> ContactGoal:
-            return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m)
+        def read() -> tuple[ContactGoal, None]:
+            return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m), None
 
         outcome, _ = await self._outcome_of(goal, read)
         end_goal(goal, outcome.reached and not goal.is_cancel_requested)
         return contact_result(outcome)
 
     async def _on_indent(self, goal: ServerGoalHandle) -> Indent.Result:
-        def read() -> IndentConduct:
+        def read() -> tuple[ContactGoal, IndentConduct]:
             stiffness = self._settings.parameters.beam_n_per_m
-            return IndentConduct(
+            test = IndentConduct(
                 goal.request,
                 self._base_frame,
                 BallTip(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
                 self._force.info,
                 simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
             )
+            return test.goal, test
 
         outcome, test = await self._outcome_of(goal, read)
         result = Indent.Result(cause=outcome.cause.value, message=outcome.message)
@@ -240,9 +221,9 @@ class ContactNode(ManagedNode):
         return result
 
     async def _outcome_of(
-        self, goal: ServerGoalHandle, read: Callable[[], ContactGoal | IndentConduct]
-    ) -> tuple[ContactResult, Any]:
-        """What became of a goal, and what it was; None: it was not begun, or the node was stopped."""
+        self, goal: ServerGoalHandle, read: Callable[[], tuple[ContactGoal, IndentConduct | None]]
+    ) -> tuple[ContactResult, IndentConduct | None]:
+        """What became of a goal, and its test; None: it has none, was not begun, or the node was stopped."""
         try:
             if self._thread is None:
                 raise ValueError("contact_node is not active")
@@ -254,40 +235,31 @@ class ContactNode(ManagedNode):
                 abort_force_n=goal.request.abort_force_n or None,
                 depth_m=goal.request.depth_limit_m or None,
             )
-            what = read()
-            asked = what.goal if isinstance(what, IndentConduct) else what
+            asked, test = read()
             require_fit(self._force.info, asked.aim.force_n)
             self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
             self.health.error(f"refused: {error}")
             return not_reached(refusal_cause(error), str(error)), None
-        self._goal, self._finished = goal, Future()
-        self._test = what if isinstance(what, IndentConduct) else None
+        self._goal, self._finished, self._test = goal, Future(), test
         outcome: ContactResult | None = await self._finished
         self._goal = self._finished = self._test = None
         if outcome is None:
             return not_reached(Cause.STOPPED, "contact_node was stopped"), None
-        return outcome, what
+        return outcome, test
 
     def _draw_back(self) -> None:
         if self._thread is not None:
             self._thread.retract()
 
-    async def _on_retract(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def _on_retract(self) -> str:
         thread = self._thread
-        try:
-            if thread is not None and thread.controller.state is State.FAULT:
-                await in_thread(self, thread.make_ready, "make_ready")  # other requests are taken
-        except ArmError as error:
-            response.message = str(error)
-            return response
+        if thread is not None and thread.controller.state is State.FAULT:
+            await in_thread(self, thread.make_ready, "make_ready")  # other requests are taken
         if thread is None or thread is not self._thread:
-            response.message = f"contact_node is {self.state_name()}"
-            return response
+            raise ValueError(f"contact_node is {self.state_name()}")
         thread.retract()
-        response.success = True
-        response.message = "asked; contact_state reports when it is idle"
-        return response
+        return "asked; contact_state reports when it is idle"
 
     # what the loop has done, in the executor's thread
 
@@ -345,8 +317,6 @@ class ContactNode(ManagedNode):
 
     def _on_poles(self, message: msg.Poles) -> None:
         thread = self._thread
-        if thread is None:
-            return
         now_ns = thread.clock.ros_ns(thread.clock.now_ns())
         try:
             touched = self._touch.hear(message, thread.controller.state, now_ns)
@@ -379,10 +349,7 @@ class ContactNode(ManagedNode):
         self._topics.take(cycle, thread)
 
 
-def main() -> None:
-    """Console script."""
-    run_node(ContactNode)
-
+main = ContactNode.run
 
 if __name__ == "__main__":
     main()

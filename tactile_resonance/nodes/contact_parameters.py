@@ -22,25 +22,13 @@ from tactile_resonance.contact.parameters import (
     read_contact,
 )
 from tactile_resonance.fields import numbers, require
-from tactile_resonance.nodes.parameters import Parameter
+from tactile_resonance.nodes.parameters import Fixed, Parameter, values
 
 _GROUPS = {"contact": ContactParameters, "limits": Limits}
-# The control loop's period is that of the running loop.
-_READ_ONLY = frozenset({"contact.period_s"})
 _LOW, _HIGH = "limits.workspace.low_m", "limits.workspace.high_m"
 _CORNERS = "Opposite corners of the box in which the tip may be, in the base [m]."
-_AT_MOST = frozenset(
-    {
-        *(
-            f"{g}.{n}"
-            for g, kind in _GROUPS.items()
-            for n in ranges_of(kind)
-            if n in STRICTER_BELOW
-        ),
-        _HIGH,
-    }
-)
-_AT_LEAST = frozenset({*(f"limits.{name}" for name in STRICTER_ABOVE), _LOW})
+# Last parts of the names of what a launch limits.
+_AT_MOST, _AT_LEAST = STRICTER_BELOW | {"high_m"}, STRICTER_ABOVE | {"low_m"}
 
 
 def contact_parameters() -> tuple[Parameter, ...]:
@@ -48,9 +36,10 @@ def contact_parameters() -> tuple[Parameter, ...]:
     made = []
     for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
         for name, (low, high, description) in ranges_of(kind).items():
-            full, default = f"{group}.{name}", getattr(defaults, name)
-            read_only = full in _READ_ONLY
-            made.append(Parameter(full, default, description, low, high, read_only=read_only))
+            full = f"{group}.{name}"
+            # that of the loop which runs
+            make = Fixed if full == "contact.period_s" else Parameter
+            made.append(make(full, getattr(defaults, name), description, low, high))
     box = _defaults()[1].workspace
     corners = ((_LOW, box.low_m), (_HIGH, box.high_m))
     return (*made, *(Parameter(full, list(corner), _CORNERS) for full, corner in corners))
@@ -62,13 +51,9 @@ class ContactSettings:
     Parameters
     ----------
     node : Node
-        Just made, with `contact_parameters` declared.
-    longer_s : float
-        By which robot and force source may be silent for longer than the limits say.
-    require_allowed : callable
-        Raises ``ValueError`` where the arm's driver would refuse what they allow.
+        Just made, with `contact_parameters` and ``simulated_stalls_s`` declared.
     take : callable
-        Receives what is new; raises ``ValueError`` where it cannot be taken now.
+        Receives what is new; raises ``ValueError`` where arm or loop cannot take it.
 
     Attributes
     ----------
@@ -76,32 +61,37 @@ class ContactSettings:
         As `read` last.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        longer_s: float,
-        require_allowed: Callable[[ContactParameters, Limits], None],
-        take: Callable[[ContactParameters, Limits], None],
-    ) -> None:
-        self._node, self._longer_s = node, longer_s
-        self._require_allowed, self._take = require_allowed, take
-        names = (*_AT_MOST, *_AT_LEAST)
+    def __init__(self, node: Node, take: Callable[[ContactParameters, Limits], None]) -> None:
+        self._node, self._take = node, take
+        names = [p.name for p in contact_parameters() if _last(p.name) in _AT_MOST | _AT_LEAST]
         self._launched = {name: node.get_parameter(name).value for name in names}
         node.add_on_set_parameters_callback(self._on_change)
 
-    def read(self) -> None:
-        """Read all; ``ValueError`` where one is not accepted."""
-        self.parameters, self.limits = self._read()
+    def read(self, **changed: Any) -> None:
+        """Read all, some with values about to be set (``**{"contact.x": 1}``).
 
-    def _read(self, **changed: Any) -> tuple[ContactParameters, Limits]:
-        parameters, limits = read_parameters(self._node, **changed)
-        limits = replace(
-            limits,
-            force_age_s=limits.force_age_s + self._longer_s,
-            arm_age_s=limits.arm_age_s + self._longer_s,
-        )
-        self._require_allowed(parameters, limits)
-        return parameters, limits
+        Raises
+        ------
+        ValueError
+            If a value is out of range or beyond the limits.
+        """
+
+        def value(full: str) -> Any:
+            return changed.get(full, self._node.get_parameter(full).value)
+
+        read = []
+        for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
+            given = {name: value(f"{group}.{name}") for name in ranges_of(kind)}
+            read.append(replace(defaults, **given))
+        parameters, limits = read
+        corners = (numbers(list(value(full)), full, 3) for full in (_LOW, _HIGH))
+        limits = replace(limits, workspace=Workspace(*corners))
+        limits.check(parameters)
+        (longer_s,) = values(self._node, "simulated_stalls_s")
+        ages_s = {name: getattr(limits, name) + longer_s for name in ("force_age_s", "arm_age_s")}
+        limits = replace(limits, **ages_s)
+        self._take(parameters, limits)
+        self.parameters, self.limits = parameters, limits
 
     def _on_change(self, changes: Sequence) -> SetParametersResult:
         """Take what is in range, and of limits what is stricter than the launch's."""
@@ -110,18 +100,16 @@ class ContactSettings:
             return SetParametersResult(successful=True)
         try:
             self._require_stricter(changed)
-            new = self._read(**changed)
-            self._take(*new)
+            self.read(**changed)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self.parameters, self.limits = new
         return SetParametersResult(successful=True)
 
     def _require_stricter(self, changed: Mapping[str, Any]) -> None:
         """Raise ``ValueError`` where what protects the tissue would admit more than at the launch."""
         for name in changed.keys() & self._launched.keys():
             value, limit = np.array(changed[name]), np.array(self._launched[name])
-            at_most = name in _AT_MOST
+            at_most = _last(name) in _AT_MOST
             stricter = value.shape == limit.shape and (
                 value <= limit if at_most else value >= limit
             )
@@ -132,27 +120,8 @@ class ContactSettings:
             require(bool(np.all(stricter)), name, value.tolist(), accepted)
 
 
-def read_parameters(node: Node, **changed: Any) -> tuple[ContactParameters, Limits]:
-    """Parameters and limits of a node, some with values about to be set (``**{"contact.x": 1}``).
-
-    Raises
-    ------
-    ValueError
-        If a value is out of range or beyond the limits.
-    """
-
-    def value(full: str) -> Any:
-        return changed.get(full, node.get_parameter(full).value)
-
-    read = []
-    for (group, kind), defaults in zip(_GROUPS.items(), _defaults(), strict=True):
-        given = {name: value(f"{group}.{name}") for name in ranges_of(kind)}
-        read.append(replace(defaults, **given))
-    parameters, limits = read
-    corners = (numbers(list(value(full)), full, 3) for full in (_LOW, _HIGH))
-    limits = replace(limits, workspace=Workspace(*corners))
-    limits.check(parameters)
-    return parameters, limits
+def _last(name: str) -> str:
+    return name.rpartition(".")[2]
 
 
 @cache

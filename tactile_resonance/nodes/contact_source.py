@@ -4,33 +4,30 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import replace
 
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import contact_from_message, spread_from_message
 from tactile_resonance.srv import ForceOver
 
-PARAMETER = Parameter(
+PARAMETER = Fixed(
     "contact_source",
     "force_over",
     "Source of the tip's place and force over a block: the service force_over of contact_node (or of the "
     "simulated bench), or the topic tcp_pose where no force is measured.",
     choices=("force_over", "tcp_pose"),
-    read_only=True,
 )
 
 ANSWER_WITHIN_S = 0.25
 """Longest time for which a record waits for its force, on the machine's clock; not in simulated time [s]."""
 DISCOVERED_WITHIN_S = 10.0
 """In simulated time a node that has just come up, and is not known to all yet, is waited for so long [s]."""
-POLL_S = 5e-4
 
 
 def make_contact_source(node: ManagedNode) -> MeasuredContact | PublishedPlace:
@@ -48,10 +45,7 @@ class MeasuredContact:
 
     def over(self, start_ns: int, end_ns: int) -> Contact:
         """Contact from one ROS time to another [ns]; with a reason where the force is unknown."""
-        deadline = time.monotonic() + min(self._within_s, DISCOVERED_WITHIN_S)
-        while not self._client.service_is_ready() and time.monotonic() < deadline:
-            time.sleep(POLL_S)
-        if not self._client.service_is_ready():
+        if not self._client.wait_for_service(min(self._within_s, DISCOVERED_WITHIN_S)):
             return Contact(reason=f"no node serves {self._client.srv_name}")
         request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))
         answered = threading.Event()

@@ -103,11 +103,6 @@ class ContactThread:
         """Whether the loop moves on, or waits for simulated time that stands."""
         return self._connecting or time.monotonic() - self._alive_s < HUNG_S
 
-    @property
-    def waits_for(self) -> str:
-        """What holds simulated time up, for people; empty: nothing of the arm."""
-        return self._arm.waits_for
-
     def configure(self, parameters: ContactParameters, limits: Limits) -> None:
         """Exchange parameters; ``ValueError`` unless idle."""
         with self._lock:

@@ -15,6 +15,7 @@ from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.nodes.contact_thread import ContactThread
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import contact_state, tip_pose, wrench_message
+from tactile_resonance.nodes.parameters import values
 from tactile_resonance.nodes.running import STREAM, RCLError
 from tactile_resonance.nodes.stop_input import StopInput
 
@@ -30,23 +31,18 @@ class ContactTopics:
     node : ManagedNode
         Whose publishers they are, until it is cleaned up.
     stop : StopInput
-    frame_id, base_frame : str
-        Of the tip, of its poses.
-    rate_hz : float
-        By the loop's clock.
 
     Attributes
     ----------
     period_s : float
-        Between two messages [s].
+        Between two messages, by the loop's clock [s].
     """
 
-    def __init__(
-        self, node: ManagedNode, stop: StopInput, frame_id: str, base_frame: str, rate_hz: float
-    ) -> None:
-        self._stop = stop
-        self._node, self.period_s, self._period_ns = node, 1 / rate_hz, round(1e9 / rate_hz)
-        self._frame_id, self._base_frame = frame_id, base_frame
+    def __init__(self, node: ManagedNode, stop: StopInput) -> None:
+        names = ("frame_id", "base_frame", "publish_rate_hz")
+        self._frame_id, self._base_frame, rate_hz = values(node, *names)
+        self._node, self._stop = node, stop
+        self.period_s, self._period_ns = 1 / rate_hz, round(1e9 / rate_hz)
         self._wrench = node.publish_on(WrenchStamped, "wrench", STREAM)
         self._pose = node.publish_on(PoseStamped, "tcp_pose", STREAM)
         self._state = node.publish_on(msg.ContactState, "contact_state", STREAM)
@@ -87,7 +83,8 @@ class ContactTopics:
         if wrenches and self._wrench.get_subscription_count():
             self._wrench.publish(wrench_message(wrenches, cycle, ros_ns, self._frame_id))
         controller, loop = thread.controller, thread.loop
-        state = contact_state(cycle, ros_ns, controller.estimate, controller.result, self._frame_id)
+        what = cycle.state, ros_ns(cycle.time_ns), controller.estimate, controller.result
+        state = contact_state(*what, self._frame_id)
         if cycle.state is State.HOLD:
             motion = controller.motion
             state.message = "" if motion is None else str(motion)

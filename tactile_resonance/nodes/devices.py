@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import queue
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.goals import answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import excitation_to_message
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.record import BetweenSamples, InputKind
 from tactile_resonance.recording.messages import record_from_message, time_from_message
@@ -39,45 +39,41 @@ if TYPE_CHECKING:
     from tactile_resonance.recording.store import StoredEntry
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "device",
         "bench",
         "What plays and reads: the simulated bench, a recording, or NI hardware.",
         choices=("bench", "replay", "nidaqmx"),
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "device_config",
         "",
         "For replay the folder or file of the recording, for nidaqmx its YAML file (see "
         "config/devices); empty for the bench.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "replay_speed",
         1.0,
         "Signal time over real time of a replay; 0: as fast as possible.",
         0.0,
         1e3,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "record_folder",
         "",
         "Folder that receives every excitation and record before it is published; empty: "
         "tactile_resonance/records/DATE-TIME in $ROS_HOME (~/.ros where that is not set), UTC; for "
         "a replay, which is on disk already, none.",
-        read_only=True,
     ),
-    Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
+    Fixed("frame_id", "tip", "Frame of the sensor's tip."),
 )
 
 
 ANSWER_TIMEOUT_S = 10.0
 
 
-def make_device(node: ManagedNode) -> AcquisitionDevice:
-    """The device that the node's parameters name.
+def make_device(node: ManagedNode) -> tuple[AcquisitionDevice, Sequence[bytes]]:
+    """The device that the node's parameters name, and serialised point results of a run that it plays again.
 
     Raises
     ------
@@ -90,7 +86,7 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
         node, "device", "device_config", "replay_speed", "frame_id"
     )
     if device == "bench":
-        return BenchDevice(node, frame_id)
+        return BenchDevice(node, frame_id), ()
     if not config:
         raise ValueError(f"device_config: empty, expected a path for the device {device}")
     path = Path(config).expanduser().absolute()
@@ -98,51 +94,34 @@ def make_device(node: ManagedNode) -> AcquisitionDevice:
         # only here: it takes a node a tenth of a second more to start
         from tactile_resonance.drivers.replay import ReplayDevice
 
-        return ReplayDevice(path, speed, _entries_of(path))
-    return NiDaqDevice(read_file(NiDaqConfig, path))
+        entries, results = _content_of(path)
+        return ReplayDevice(path, speed, entries), results
+    return NiDaqDevice(read_file(NiDaqConfig, path)), ()
 
 
-def replayed_results(node: ManagedNode) -> tuple[bytes, ...]:
-    """Serialised point results of the run that is played again; of any other device none."""
-    device, config = values(node, "device", "device_config")
-    path = Path(config).expanduser().absolute()
-    if device != "replay" or not _is_run(path):
-        return ()
-    from tactile_resonance.scan.recorded import recorded_results
-    from tactile_resonance.scan.run_content import read_run
-
-    return tuple(recorded_results(read_run(path)))
-
-
-def _is_run(path: Path) -> bool:
-    return (path / "run.json").is_file()
-
-
-def _entries_of(path: Path) -> list[StoredEntry] | None:
-    """The measurements of a scan's run; None for a folder that the device reads without them."""
-    if not _is_run(path):
-        return None
+def _content_of(path: Path) -> tuple[list[StoredEntry] | None, Sequence[bytes]]:
+    """Measurements and point results of a scan's run; None for a folder that the device reads itself."""
+    if not (path / "run.json").is_file():
+        return None, ()
     try:
         # only here: everything else works without the library for recordings
-        from tactile_resonance.scan.recorded import run_entries
+        from tactile_resonance.scan.recorded import recorded_results, run_entries
         from tactile_resonance.scan.run_content import read_run
     except ImportError as error:
         raise ValueError(
             f"device: replay of a run: {error.name} not found; pip install rosbags"
         ) from error
-    return run_entries(read_run(path))
+    run = read_run(path)
+    return run_entries(run), tuple(recorded_results(run))
 
 
-def open_store(
-    folder: str, device: str, environment: Mapping[str, str] = os.environ
-) -> RecordStore | None:
+def open_store(folder: str, device: str) -> RecordStore | None:
     """The store of a node's records.
 
     Parameters
     ----------
     folder, device : str
         The parameters ``record_folder`` and ``device``.
-    environment : mapping
 
     Returns
     -------
@@ -158,8 +137,8 @@ def open_store(
         return RecordStore(Path(folder).expanduser().absolute())
     if device == "replay":
         return None
-    home = environment.get("ROS_HOME")
-    parent = (Path(home) if home else Path.home() / ".ros") / "tactile_resonance" / "records"
+    home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+    parent = home / "tactile_resonance" / "records"
     parent.mkdir(parents=True, exist_ok=True)
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     number = 1
@@ -174,8 +153,8 @@ def open_store(
             return RecordStore(path)
 
 
-class BenchDevice:
-    """Keeps the contract of `AcquisitionDevice`; called from a thread other than the executor's.
+class BenchDevice(AcquisitionDevice):
+    """The simulated bench; called from a thread other than the executor's.
 
     In simulated time it lets time go on to the end of each block, where a conductor's `go` ends.
     """
@@ -194,10 +173,6 @@ class BenchDevice:
         self._answer_s = node.hung_after_s if node.time_server else ANSWER_TIMEOUT_S
         topic = "bench/block"
         self._heard = node.create_subscription(msg.Record, topic, self._blocks.put, RESULTS)
-
-    def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
-        """The bench plays what is asked."""
-        return list(excitations)
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
         """Wait for the bench."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -25,9 +24,8 @@ class _Flow:
     """Messages of one topic, in or out."""
 
     total: int = 0
-    reported: int = 0
     last_s: float = float("nan")
-    took_s: list[float] = field(default_factory=list)
+    took_s: list[float] = field(default_factory=list)  # of each since the last report
 
 
 class Health:
@@ -36,21 +34,11 @@ class Health:
     Parameters
     ----------
     node : Node
-    state : callable
-        Name of the node's lifecycle state.
-    details : callable
-        Further figures of the node by name.
+        With methods ``state_name``, and ``details`` for further figures by name.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        state: Callable[[], str],
-        details: Callable[[], Mapping[str, str]],
-    ) -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
-        self._state = state
-        self._details = details
         self._flows: dict[str, _Flow] = {}
         self._error = ""
         self._error_s = float("-inf")
@@ -58,15 +46,12 @@ class Health:
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.create_timer(PERIOD_S, self._publish, clock=STEADY)
 
-    def saw(self, topic: str) -> None:
-        """Count one message of a topic."""
+    def saw(self, topic: str, seconds: float) -> None:
+        """Count one message of a topic, which kept the node busy for so long [s]."""
         flow = self._flows.setdefault(topic, _Flow())
         flow.total += 1
         flow.last_s = time.monotonic()
-
-    def took(self, topic: str, seconds: float) -> None:
-        """Keep how long one message of a topic kept the node busy."""
-        self._flows.setdefault(topic, _Flow()).took_s.append(seconds)
+        flow.took_s.append(seconds)
 
     def error(self, text: str) -> None:
         """Log an error and remember it."""
@@ -88,8 +73,7 @@ class Health:
         return reason
 
     def _publish(self) -> None:
-        now_s = time.monotonic()
-        state = self._state()
+        now_s, state = time.monotonic(), self._node.state_name()
         recent = now_s - self._error_s < ERROR_REMEMBERED_S
         level, message = DiagnosticStatus.OK, state
         if recent:
@@ -97,8 +81,7 @@ class Health:
             message = f"{state}: {self._error}"
         values = {"state": state}
         for topic, flow in self._flows.items():
-            rate_hz = (flow.total - flow.reported) / (now_s - self._reported_s)
-            flow.reported = flow.total
+            rate_hz = len(flow.took_s) / (now_s - self._reported_s)
             if flow.took_s:
                 mean_s = sum(flow.took_s) / len(flow.took_s)
                 values[f"{topic}{MEAN}"] = f"{1e3 * mean_s:.3g}"
@@ -110,7 +93,7 @@ class Health:
         if self._error:
             values["last error"] = self._error
             values["last error: age [s]"] = f"{now_s - self._error_s:.3g}"
-        values.update(self._details())
+        values.update(self._node.details())
         self._reported_s = now_s
         name = self._node.get_fully_qualified_name()
         status = DiagnosticStatus(

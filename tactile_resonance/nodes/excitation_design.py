@@ -13,17 +13,13 @@ from tactile_resonance.action import Measure
 from tactile_resonance.crest_factor import compress_crest_factor
 from tactile_resonance.drivers.acquisition import DeviceInfo
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter
 from tactile_resonance.poles.structure import PoleBand
-from tactile_resonance.recording.messages import each_from_message
+from tactile_resonance.recording.messages import GRIDS, each_from_message, key_of
 from tactile_resonance.sensor import MAX_LEVEL_V
 
-GRIDS = {
-    Measure.Goal.GRID_FULL: Grid.FULL,
-    Measure.Goal.GRID_ODD: Grid.ODD,
-    Measure.Goal.GRID_ODD_RANDOM: Grid.ODD_RANDOM,
-}
-
+ASKED = ("sample_rate_hz", "samples_per_period", "level_v", "periods", "realisations")
+"""Parameters that a goal may state too, by the names that `design_multisine` has for them."""
 NO_RECORDS = "record_folder: "
 """A measurement whose message begins so failed because records cannot be written."""
 MOST_REALISATIONS = 1000  # each is designed, with all its lines, before the first is played
@@ -34,19 +30,18 @@ PARAMETERS = (
     Parameter("f_min_hz", 10.0, "Lowest excited line [Hz].", 1e-3, 1e7),
     Parameter("f_max_hz", 10e3, "Highest excited line [Hz].", 1e-3, 1e7),
     Parameter("level_v", 1.0, "Root mean square of the drive [V].", 1e-6, 1e3),
-    Parameter(
+    Fixed(
         "max_level_v",
         MAX_LEVEL_V,
         "The sensor's limit: a level above is refused [V rms].",
         1e-6,
         1e3,
-        read_only=True,
     ),
     Parameter(
         "grid",
         "full",
         "Which harmonics are excited.",
-        choices=tuple(grid.value for grid in GRIDS.values()),
+        choices=tuple(grid.value for grid in GRIDS if grid is not Grid.CUSTOM),
     ),
     Parameter(
         "mains_hz",
@@ -97,10 +92,8 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
     ValueError
         Names the field, its value, and what is accepted.
     """
-    rate, samples, low, high, level, max_level, grid, mains, beside, *rest = values(
-        node, *(parameter.name for parameter in PARAMETERS)
-    )
-    periods, realisations, seed, passes = rest
+    given = {each.name: node.get_parameter(each.name).value for each in PARAMETERS}
+    asked = {name: getattr(goal, name) or given[name] for name in ASKED}
     if goal.silent and goal.level_v:
         raise ValueError(f"level_v: {goal.level_v:g}, a silent measurement plays nothing: 0")
     counts = len(goal.excited_low_hz), len(goal.excited_high_hz)
@@ -113,28 +106,24 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
         raise ValueError(
             f"f_min_hz, f_max_hz: {goal.f_min_hz:g}, {goal.f_max_hz:g}, 0 are accepted beside excited_low_hz"
         )
-    level = goal.level_v or level
+    level, max_level = asked["level_v"], given["max_level_v"]
     if not level <= max_level:
         raise ValueError(f"level_v: {level:g}, the sensor bears at most {max_level:g} V rms")
-    if goal.grid and goal.grid not in GRIDS:
-        raise ValueError(f"grid: {goal.grid}, accepted are {sorted(GRIDS)}, 0 for the parameter")
-    realisations = goal.realisations or realisations
+    grid = key_of(GRIDS, goal.grid, "grid") if goal.grid else Grid(given["grid"])
+    realisations = asked["realisations"]
     if realisations > MOST_REALISATIONS:
         raise ValueError(f"realisations: {realisations}, accepted is up to {MOST_REALISATIONS}")
+    ends_hz = goal.f_min_hz or given["f_min_hz"], goal.f_max_hz or given["f_max_hz"]
     excitations = [
         design_multisine(
-            sample_rate_hz=goal.sample_rate_hz or rate,
-            samples_per_period=goal.samples_per_period or samples,
-            band_hz=stretches_hz or (goal.f_min_hz or low, goal.f_max_hz or high),
-            level_v=level,
-            grid=GRIDS[goal.grid] if goal.grid else Grid(grid),
-            mains_hz=(mains,) if mains else (),
-            lines_beside=beside,
+            **asked,
+            band_hz=stretches_hz or ends_hz,
+            grid=grid,
+            mains_hz=(given["mains_hz"],) if given["mains_hz"] else (),
+            lines_beside=given["mains_lines_beside"],
             sweep=goal.sweep,
-            seed=goal.seed or seed + measurements,
+            seed=goal.seed or given["seed"] + measurements,
             realisation=realisation,
-            realisations=realisations,
-            periods=goal.periods or periods,
             measurement_id=goal.measurement_id,
             label=goal.label,
             bands=each_from_message(PoleBand, goal.bands),
@@ -143,7 +132,7 @@ def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation
     ]
     if goal.silent:
         return [replace(each, amplitude_v=np.zeros(each.harmonics.size)) for each in excitations]
-    if passes and not goal.sweep:
+    if (passes := given["compression_passes"]) and not goal.sweep:
         return [compress_crest_factor(each, passes=passes) for each in excitations]
     return excitations
 

@@ -13,19 +13,14 @@ from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.drivers.acquisition import (
-    AcquiredBlock,
-    AcquisitionDevice,
-    DeviceError,
-    DeviceInfo,
-)
+from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.fields import counted
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes import contact_source, devices, excitation_design
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread
 from tactile_resonance.nodes.messages import excitation_to_message, record_to_message
-from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS, run_node
+from tactile_resonance.nodes.parameters import Fixed, Parameter, values
+from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS
 from tactile_resonance.record import Origin, Record
 from tactile_resonance.recording.store import RecordStore
 
@@ -35,12 +30,11 @@ PARAMETERS = (
     contact_source.PARAMETER,
     TIME_SERVER,
     HUNG_AFTER,
-    Parameter(
+    Fixed(
         "keep_all_records",
         False,
         "Keep in record_folder what the run of a scan holds, too. Else the records of a point that is done are "
         "removed there as soon as point_result tells that all of them are in its run, on the disk.",
-        read_only=True,
     ),
     Parameter("block_timeout_s", 10.0, "Longest wait for a block [s].", 0.1, 3600.0),
 )
@@ -77,9 +71,8 @@ class ExcitationNode(ManagedNode):
         (self._frame_id,) = values(self, "frame_id")
         self._excitations = self.publish_on(msg.Excitation, "excitation", EXCITATIONS)
         self._records = self.publish_on(msg.Record, "record", RESULTS)
-        self._device: AcquisitionDevice = devices.make_device(self)
+        self._device, self._replayed = devices.make_device(self)
         self.resources.callback(self._device.close)
-        self._replayed = devices.replayed_results(self)
         if self._replayed:
             self._results = self.publish_on(msg.PointResult, "point_result", POINT_RESULTS)
         elif not values(self, "keep_all_records")[0]:
@@ -282,7 +275,7 @@ def main() -> None:
     """Console script."""
     # the thread that reads the device takes over from that of the executor within this, and not 5 ms
     sys.setswitchinterval(1e-4)
-    run_node(ExcitationNode)
+    ExcitationNode.run()
 
 
 if __name__ == "__main__":

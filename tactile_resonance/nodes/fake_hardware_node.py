@@ -13,19 +13,15 @@ from tactile_resonance import msg
 from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import ClockLostError
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.bench_player import (
-    BenchNow,
-    BenchPlayer,
-    BenchServer,
-    PlantChild,
-    bench_record,
-)
+from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchServer, PlantChild
+from tactile_resonance.nodes.ideal_contact import IdealContact
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
-from tactile_resonance.nodes.parameters import Parameter, file_of, values
-from tactile_resonance.nodes.running import RESULTS, run_node
-from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_to_response
+from tactile_resonance.nodes.parameters import Fixed, Parameter, file_of, values
+from tactile_resonance.nodes.running import RESULTS
+from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_message, truth_to_response
 from tactile_resonance.nodes.stop_input import StopInput
+from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
@@ -35,39 +31,35 @@ from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.srv import Play, Truth
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "scene",
         "config/scenes/gelatine_phantoms.yaml",
         "What lies on the table: a file, absolute or in the package's share folder.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "robot_host",
         "",
         "Address 127.x.y.z at which a simulated robot with its load cell is started too; the tip is then "
         "where that robot holds it. Empty: ideal contact.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "serve_contact",
         False,
         "Without a robot: serve make_contact and retract with ideal contact, as contact_node does; else the "
         "tip is where tcp_pose states.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "table_in_base",
         [*TABLE_IN_BASE],
         "Frame of the scene in the robot's base: position [m] and rotation vector [rad].",
-        read_only=True,
     ),
     TIME_SERVER,
     Parameter("seed", 1, "Seed of the simulated noise.", 1, 2**62),
     Parameter("noise", True, "Sensor noise."),
     Parameter("quantisation", True, "Converters that count and saturate."),
     Parameter("nonlinearity", False, "The sensor's static nonlinearity."),
-    Parameter("frame_id", "tip", "Frame of the sensor's tip.", read_only=True),
-    Parameter("base_frame", "base", "Frame of the robot's base, of all poses.", read_only=True),
+    Fixed("frame_id", "tip", "Frame of the sensor's tip."),
+    Fixed("base_frame", "base", "Frame of the robot's base, of all poses."),
 )
 
 
@@ -94,7 +86,7 @@ class FakeHardwareNode(ManagedNode):
         self._played: tuple[int, Play.Response] | None = None  # what is played, and the answer
         self._touch: SimulatedTip | None = None
         (serves_contact,) = values(self, "serve_contact")
-        self._stop = StopInput(self, self._draw_back) if serves_contact else None
+        self._stop = StopInput(self) if serves_contact else None
 
     def configure(self) -> None:
         """Read the scene, make the sensor and, if the parameters ask for one, the robot."""
@@ -113,8 +105,12 @@ class FakeHardwareNode(ManagedNode):
             self.resources.callback(plant.close)
         elif server:
             self.resources.callback(BenchServer(server).close)
-        self._now_ns = BenchNow(self, server)
-        self._touch = SimulatedTip(self, self._bench, read, plant, self._now_ns, self._stop)
+        self._now_ns = BenchNow(self)
+        self._touch = SimulatedTip(self, self._bench, read, plant, self._now_ns)
+        if plant is None and self._stop is None:
+            self._touch.follow_poses()
+        elif plant is None:
+            IdealContact(self, self._touch, self._stop)
         self._blocks = self.publish_on(msg.Record, "bench/block", RESULTS)
         self.serve(Play, "bench/play", self._on_play)
         self.serve_trigger("bench/stop", self._silence)
@@ -134,10 +130,6 @@ class FakeHardwareNode(ManagedNode):
         self._player.silence()
         self._played = None
         return ""
-
-    def _draw_back(self) -> None:
-        if self._touch is not None:
-            self._touch.draw_back()
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
         try:
@@ -226,17 +218,24 @@ class FakeHardwareNode(ManagedNode):
             if so_far is not None:
                 so_far.extend(excitation.period_s, touch.contact_over(end_ns - block_ns, end_ns))
                 pose.header.stamp = time_message((start_ns + end_ns) // 2)
-                touch.tell_truth(pose, tip, excitation.measurement_id, so_far.parts)
-            record = bench_record(next(blocks), excitation, start_ns, self._frame_id)
+                whose = excitation.measurement_id, self._frame_id
+                touch.truths.publish(truth_message(pose, tip, so_far.parts, *whose))
+            block = next(blocks)
+            origin = Origin(
+                measurement_id=excitation.measurement_id,
+                excitation_id=excitation.excitation_id,
+                time_ns=start_ns + block.origin.time_ns,
+                frame_id=self._frame_id,
+                label=excitation.label,
+                simulated=True,
+            )
+            record = replace(block, realisation=excitation.realisation, origin=origin)
             self._blocks.publish(record_to_message(record))
 
         return hand_out
 
 
-def main() -> None:
-    """Console script."""
-    run_node(FakeHardwareNode)
-
+main = FakeHardwareNode.run
 
 if __name__ == "__main__":
     main()

@@ -35,14 +35,13 @@ from tactile_resonance.contact.vectors import (
     vector_from_turn,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, values
+from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import LATCHED, STREAM
 
-BROADCAST_TF = Parameter(
+BROADCAST_TF = Fixed(
     "broadcast_tf",
     True,
     "Broadcast where its frames stand, where tf2 is installed; false: another program does.",
-    read_only=True,
 )
 
 ABSENT = "other frames need tf2_ros, which is not installed here"

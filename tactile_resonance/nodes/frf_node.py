@@ -12,7 +12,7 @@ from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import frf_to_message
 from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import EXCITATIONS, RESULTS, run_node
+from tactile_resonance.nodes.running import EXCITATIONS, RESULTS
 from tactile_resonance.record import Record
 from tactile_resonance.recording.messages import excitation_from_message, record_from_message
 
@@ -129,10 +129,7 @@ class FrfNode(ManagedNode):
         )
 
 
-def main() -> None:
-    """Console script."""
-    run_node(FrfNode)
-
+main = FrfNode.run
 
 if __name__ == "__main__":
     main()

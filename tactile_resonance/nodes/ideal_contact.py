@@ -10,19 +10,14 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.action.server import ServerGoalHandle
 
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.clock import ClockLostError, SimulatedClock
-from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.result import (
     Cause,
@@ -32,78 +27,23 @@ from tactile_resonance.contact.result import (
     refusal_cause,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
-from tactile_resonance.nodes.messages import contact_result, time_message, write_force_over
+from tactile_resonance.nodes.messages import (
+    contact_result,
+    contact_state,
+    pose_to_message,
+    time_message,
+)
+from tactile_resonance.nodes.parameters import values
 from tactile_resonance.nodes.running import STREAM
+from tactile_resonance.nodes.simulated_tip import SimulatedTip, Stay, pressing
 from tactile_resonance.nodes.stop_input import StopInput
-from tactile_resonance.recording.messages import time_from_message
-from tactile_resonance.srv import ForceOver
+from tactile_resonance.record import Contact
 
 CONTACT_S = 0.5
 """From a goal to the force that it asks for [s]: about as long as a robot that is near takes."""
 PUBLISH_S = 0.05
-MOST_STAYS = 1000
-NAN = math.nan
-
-
-@dataclass(frozen=True)
-class Stay:
-    """The tip somewhere, from a time on.
-
-    Attributes
-    ----------
-    since_ns : int
-        ROS time [ns].
-    force_n : float
-        0 in air.
-    pose : PoseStamped
-        With an empty frame where it is unknown.
-    """
-
-    since_ns: int
-    force_n: float
-    pose: PoseStamped
-
-
-class Stays:
-    """Where the tip was and how hard it pressed, and what follows for an interval."""
-
-    def __init__(self) -> None:
-        self._stays: deque[Stay] = deque([Stay(0, 0.0, PoseStamped())], maxlen=MOST_STAYS)
-
-    @property
-    def newest(self) -> Stay:
-        """The present one."""
-        return self._stays[-1]
-
-    def add(self, stay: Stay) -> None:
-        """The tip is somewhere else from now on."""
-        self._stays.append(stay)
-
-    def serve(self, request: ForceOver.Request, response: ForceOver.Response) -> ForceOver.Response:
-        """The force over an interval, as the service `force_over` answers."""
-        start_ns, end_ns = time_from_message(request.start), time_from_message(request.end)
-        if not start_ns < end_ns:
-            return write_force_over(response, "the interval is empty")
-        spans: list[tuple[float, float]] = []  # length [ns], force
-        until_ns = end_ns
-        for stay in reversed(self._stays):
-            span_ns = max(0, until_ns - max(start_ns, stay.since_ns))
-            if span_ns:
-                spans.append((span_ns, stay.force_n))
-                response.tip_pose = stay.pose
-            until_ns = min(until_ns, stay.since_ns)
-        seen_ns = sum(span_ns for span_ns, _ in spans)
-        response.coverage = seen_ns / (end_ns - start_ns)
-        if until_ns > start_ns:
-            text = f"the block begins before what is kept, {MOST_STAYS} places"
-            return write_force_over(response, text)
-        mean_n = sum(span_ns * force_n for span_ns, force_n in spans) / seen_ns
-        square = sum(span_ns * (force_n - mean_n) ** 2 for span_ns, force_n in spans) / seen_ns
-        forces_n = [force_n for _, force_n in spans]
-        spread = ForceSpread(square**0.5, min(forces_n), max(forces_n))
-        return write_force_over(response, "", mean_n, 0.0, spread)
-
-
+CLEAR_M = 0.05
+"""Above the table: where the tip is before its first goal."""
 DRAWN_BACK = not_reached(Cause.CANCELLED, "drawn back on request")
 
 
@@ -114,38 +54,21 @@ class IdealContact:
     ----------
     node : ManagedNode
         Owns the interfaces, until it is cleaned up.
-    stays : Stays
-        Receives each place of the tip.
-    force_at : callable
-        From a place (3,) in the base [m] and the force asked for [N]: the depth that brings it [m] and the
-        height of the surface above that place [m]; None where nothing is to be touched.
-    placed : callable
-        Called when the tip is put somewhere.
-    now_ns : callable
-        ROS time now [ns].
+    tip : SimulatedTip
+        That it brings to the tissue.
     stop : StopInput
-    base_frame, frame_id : str
     """
 
-    def __init__(
-        self,
-        node: ManagedNode,
-        stays: Stays,
-        force_at: Callable[[np.ndarray, float], tuple[float, float] | None],
-        placed: Callable[[], None],
-        now_ns: Callable[[], int],
-        stop: StopInput,
-        base_frame: str,
-        frame_id: str,
-    ) -> None:
-        self._node, self._stays, self._force_at, self._placed = node, stays, force_at, placed
-        self._now_ns = now_ns
-        self._base_frame, self._frame_id = base_frame, frame_id
+    def __init__(self, node: ManagedNode, tip: SimulatedTip, stop: StopInput) -> None:
+        self._node, self._tip, self._stop = node, tip, stop
+        (self._base_frame,) = values(node, "base_frame")
+        place = Contact(position_m=tip.above_table(CLEAR_M), frame_id=self._base_frame)
+        tip.stays.add(Stay(0, 0.0, pose_to_message(place)))
         self._lock = threading.Lock()
         self._drawn_back = threading.Event()
         self._state: State = State.IDLE
         self._result: ContactResult | None = None
-        self._stop = stop
+        stop.draw_back = self.draw_back
         self._states = node.publish_on(msg.ContactState, "contact_state", STREAM)
         self._poses = node.publish_on(PoseStamped, "tcp_pose", STREAM)
         self._wrenches = node.publish_on(WrenchStamped, "wrench", STREAM)
@@ -156,7 +79,7 @@ class IdealContact:
             "make_contact",
             self._on_goal,
             on_cancel=lambda _: self.draw_back(),
-            refusal=lambda _: "the tip is stopped" if stop.stopped else "",
+            refuses=lambda _: stop.stopped,
         )
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
@@ -182,19 +105,17 @@ class IdealContact:
 
     def _touch(self, request: MakeContact.Goal) -> ContactResult:
         self._say(State.APPROACH)
-        began_ns = self._now_ns()
+        began_ns = self._tip.now_ns()
         if not self._wait(CONTACT_S):
             return self._say(State.IDLE, DRAWN_BACK)
         place = request.pose.pose.position
-        found = self._force_at(np.array([place.x, place.y, place.z]), request.force_n)
+        found = self._tip.found_at(np.array([place.x, place.y, place.z]), request.force_n)
         if found is None:
             missing = not_reached(Cause.SURFACE_MISSING, "nothing to touch there")
             return self._say(State.IDLE, missing)
-        now_ns = self._now_ns()
-        pose = PoseStamped(header=request.pose.header, pose=request.pose.pose)
-        pose.header.stamp = time_message(now_ns)
-        self._stays.add(Stay(now_ns, request.force_n, pose))
-        self._placed()
+        now_ns = self._tip.now_ns()
+        request.pose.header.stamp = time_message(now_ns)
+        self._tip.place(Stay(now_ns, request.force_n, request.pose))
         took_s, (depth_m, surface_m) = (now_ns - began_ns) * 1e-9, found
         reached = ContactResult(
             reached=True,
@@ -251,9 +172,7 @@ class IdealContact:
         """Lift the tip off, also one that is on its way."""
         self._drawn_back.set()
         if self._state is State.HOLD:
-            now_ns = self._now_ns()
-            self._stays.add(Stay(now_ns, 0.0, self._stays.newest.pose))
-            self._placed()
+            self._tip.place(Stay(self._tip.now_ns(), 0.0, self._tip.stays.newest.pose))
             self._say(State.IDLE, DRAWN_BACK)
 
     def _say(self, state: State, result: ContactResult | None = None) -> ContactResult:
@@ -263,27 +182,14 @@ class IdealContact:
         return result
 
     def _publish(self) -> None:
-        now = time_message(self._now_ns())
-        stay, result = self._stays.newest, self._result
-        state = msg.ContactState(state=self._state.value, force_n=NAN, depth_m=NAN)
-        state.header.stamp, state.header.frame_id = now, self._frame_id
+        now_ns, frame_id = self._tip.now_ns(), self._tip.frame_id
+        stay, result, now = self._tip.stays.newest, self._result, time_message(now_ns)
+        state = contact_state(self._state, now_ns, None, result, frame_id)
         state.instance, state.stopped = self._node.instance, self._stop.stopped
-        state.zero_moved_n = state.stiffness_n_per_m = state.tissue_moves_m = NAN
-        if result is not None:
-            state.cause, state.message = result.cause.value, result.message
         if self._state is State.HOLD:
             state.force_n, state.depth_m = stay.force_n, result.depth_m
         self._states.publish(state)
         if stay.pose.header.frame_id:
-            pose = PoseStamped(header=stay.pose.header, pose=stay.pose.pose)
-            pose.header.stamp = now
-            self._poses.publish(pose)
-        self._wrenches.publish(pressing(stay.force_n, now, self._frame_id))
-
-
-def pressing(force_n: float, stamp: Time, frame_id: str) -> WrenchStamped:
-    """Wrench of a force along the normal."""
-    wrench = WrenchStamped()
-    wrench.header.stamp, wrench.header.frame_id = stamp, frame_id
-    wrench.wrench.force.z = force_n
-    return wrench
+            stay.pose.header.stamp = now
+            self._poses.publish(stay.pose)
+        self._wrenches.publish(pressing(stay.force_n, now, frame_id))

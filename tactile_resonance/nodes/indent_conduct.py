@@ -13,6 +13,7 @@ from tactile_resonance.contact.indentation_record import IndentationRecorder
 from tactile_resonance.contact.interfaces import ForceInfo
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.result import Cause, ContactResult
+from tactile_resonance.fields import check_not_negative
 from tactile_resonance.mechanics.indentation import BallTip, Protocol
 from tactile_resonance.nodes.messages import time_message, touch_of
 from tactile_resonance.recording.messages import PROTOCOLS, key_of, write_indentation
@@ -55,10 +56,7 @@ class IndentConduct:
     ) -> None:
         self._request, self._base_frame = request, base_frame
         protocol = key_of(PROTOCOLS, request.protocol, "protocol")
-        for name in ("hold_s", "press_speed_m_s", "unload_speed_m_s"):
-            value = getattr(request, name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name}: {value}, accepted is a number, 0 or above")
+        check_not_negative(request, "hold_s", "press_speed_m_s", "unload_speed_m_s")
         if protocol is Protocol.INDENTATION and not request.unload_speed_m_s:
             raise ValueError("unload_speed_m_s: 0, accepted with INDENTATION is a speed above 0")
         hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION

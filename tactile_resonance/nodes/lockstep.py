@@ -14,7 +14,8 @@ from collections.abc import Callable, Sequence
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from tactile_resonance.clock import Demand, OfRosTime
+from tactile_resonance.clock import Demand
+from tactile_resonance.contact.interfaces import LoopClock
 from tactile_resonance.nodes.running import PLACES
 from tactile_resonance.recording.messages import time_from_message
 
@@ -43,8 +44,8 @@ class Arrivals:
             return self._changed.wait_for(lambda: self.newest_ns >= stamp_ns, seconds)
 
 
-class Lockstep(OfRosTime):
-    """The clock of a loop that a simulated controller leads, and that leads it (a `LoopClock`).
+class Lockstep(LoopClock):
+    """The clock of a loop that a simulated controller leads, and that leads it, as fast as it can.
 
     Parameters
     ----------
@@ -91,13 +92,3 @@ class Lockstep(OfRosTime):
                     self.while_waiting()
                     arrivals.lost = time.monotonic() > lost_s
             self._now_ns = step_ns
-
-    def ask_ns(self) -> int:
-        """Time now [ns]: it does not go on without the loop."""
-        return self._now_ns
-
-    def hurry(self) -> None:
-        """Nothing to do: time goes on as fast as it can."""
-
-    def close(self) -> None:
-        """Answer no more: the controller stands, and what it does then is its own."""

@@ -8,7 +8,7 @@ import os
 import threading
 import time
 import traceback
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Any
@@ -32,10 +32,10 @@ from tactile_resonance import msg
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.nodes.diagnostics import Health
-from tactile_resonance.nodes.parameters import Parameter, declare, values
-from tactile_resonance.nodes.running import BEATS, STEADY, RCLError
+from tactile_resonance.nodes.parameters import Fixed, Parameter, declare, values
+from tactile_resonance.nodes.running import BEATS, STEADY, RCLError, run_node
 
-# What a configuration may be refused with; anything else is a defect and keeps its traceback.
+# What a configuration or a request may be refused with; anything else is a defect and keeps its traceback.
 REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterException)
 
 BEAT_S = 0.2
@@ -44,21 +44,19 @@ BEAT_S = 0.2
 KEEP_RESULT_S = 900
 """The result of a goal that has ended can be asked for so long [s]."""
 
-TIME_SERVER = Parameter(
+TIME_SERVER = Fixed(
     "time_server",
     "",
     "Address HOST:PORT of a simulated bench's time, in which the node then lives; empty: the machine's clock.",
-    read_only=True,
 )
 
-HUNG_AFTER = Parameter(
+HUNG_AFTER = Fixed(
     "hung_after_s",
     60.0,
     "In simulated time: a node without an answer for so long, by this machine's clock, hangs [s]; the "
     "scan ends, and can be resumed.",
     5.0,
     86400.0,
-    read_only=True,
 )
 
 
@@ -85,7 +83,7 @@ class ManagedNode(LifecycleNode):
             if service.srv_type is ChangeState:
                 service.callback = partial(self._change_state, service.callback)
         declare(self, parameters)
-        self.health = Health(self, self.state_name, self.details)
+        self.health = Health(self)
         self.instance = int.from_bytes(os.urandom(7), "big")
         # started by the first subscriber: each call wakes the executor: most of the cost of an idle node
         self._beat_timer = self.steady_timer(BEAT_S, self._beat)
@@ -94,6 +92,11 @@ class ManagedNode(LifecycleNode):
         self._beats = self.create_publisher(
             msg.Heartbeat, "heartbeat", BEATS, event_callbacks=events
         )
+
+    @classmethod
+    def run(cls) -> None:
+        """Make and spin one, as the console script of its module does."""
+        run_node(cls)
 
     # What a subclass defines
 
@@ -148,10 +151,9 @@ class ManagedNode(LifecycleNode):
 
         def heard(message: Any) -> None:
             if self.active or always:
-                self.health.saw(topic)
                 begun_s = time.perf_counter()
                 callback(message)
-                self.health.took(topic, time.perf_counter() - begun_s)
+                self.health.saw(topic, time.perf_counter() - begun_s)
 
         subscription = self.create_subscription(kind, topic, heard, qos, raw=raw)
         self.resources.callback(self.destroy_subscription, subscription)
@@ -163,14 +165,14 @@ class ManagedNode(LifecycleNode):
         service = self.create_service(kind, name, callback, callback_group=group)
         self.resources.callback(self.destroy_service, service)
 
-    def serve_trigger(self, name: str, do: Callable[[], str]) -> None:
-        """Service without a request; `do` returns the answer's message, or raises ``ValueError`` with why."""
+    def serve_trigger(self, name: str, do: Callable[[], str | Awaitable[str]]) -> None:
+        """Service without a request; `do` returns the answer, or raises one of `REFUSALS` with why."""
 
-        def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        async def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
-                response.message = do()
+                response.message = await await_or_execute(do)
                 response.success = True
-            except ValueError as error:
+            except REFUSALS as error:
                 response.message = str(error)
             return response
 
@@ -188,16 +190,16 @@ class ManagedNode(LifecycleNode):
         name: str,
         callback: Callable[[ServerGoalHandle], Awaitable[Any]],
         on_cancel: Callable[[ServerGoalHandle], None] = lambda _: None,
-        refusal: Callable[[Any], str | Awaitable[str]] = lambda _: "",
+        refuses: Callable[[Any], bool | Awaitable[bool]] = lambda _: False,
     ) -> None:
         """Action until the node is cleaned up.
 
-        Goals are accepted while the node is active, unless `refusal`, which may wait, has a reason
-        against them. A request to cancel is always accepted; the callback ends the goal.
+        Goals are accepted while the node is active, unless `refuses`, which may wait, is true of them. A
+        request to cancel is always accepted; the callback ends the goal.
         """
 
         async def on_request(goal: Any) -> GoalResponse:
-            accepted = self.active and not await await_or_execute(refusal, goal) and self.active
+            accepted = self.active and not await await_or_execute(refuses, goal) and self.active
             return GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
 
         def on_cancel_request(goal: ServerGoalHandle) -> CancelResponse:
@@ -216,18 +218,17 @@ class ManagedNode(LifecycleNode):
         )
         self.resources.callback(server.destroy)
 
-    def set_up(self, make: Callable[[], None]) -> Callable[[], None]:
-        """Run `make`, and return a function that undoes all that it set up.
-
-        Without a call of that function it is undone when the node is cleaned up.
-        """
+    @contextlib.contextmanager
+    def with_set_up(self, make: Callable[[], None]) -> Iterator[None]:
+        """Run `make`; all that it set up is undone at the end of the context, or as the node is cleaned up."""
         rest, self.resources = self.resources, ExitStack()
         try:
             make()
         finally:
             made, self.resources = self.resources, rest
             self.resources.callback(made.close)
-        return made.close
+        with made:
+            yield
 
     def every(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Timer until the node is cleaned up; called while it is active, by this machine's clock."""

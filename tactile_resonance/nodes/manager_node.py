@@ -16,18 +16,13 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from tactile_resonance.nodes.diagnostics import Health
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.parameters import Fixed, Parameter, declare, values
 from tactile_resonance.nodes.running import STEADY, run_node
 
 STREAM_NODES = ["excitation_node", "frf_node", "poles_node"]
 
 PARAMETERS = (
-    Parameter(
-        "nodes",
-        STREAM_NODES,
-        "Names of the managed nodes, in the order in which they come up.",
-        read_only=True,
-    ),
+    Fixed("nodes", STREAM_NODES, "Names of the managed nodes, in the order in which they come up."),
     Parameter("answer_timeout_s", 15.0, "Longest wait for a node to change [s].", 0.1, 3600.0),
     Parameter("retry_s", 1.0, "First wait after a refusal [s]; doubled each time.", 0.05, 60.0),
 )
@@ -95,7 +90,7 @@ class ManagerNode(Node):
             raise ValueError("nodes: empty, expected names of nodes")
         self._wanted_up = True
         self._was_up = False
-        self.health = Health(self, self._summary, self._details)
+        self.health = Health(self)
         self.create_service(Trigger, "~/start", partial(self._want, True))
         self.create_service(Trigger, "~/shut_down", partial(self._want, False))
         self._timer = self.create_timer(TICK_S, self._tick, clock=STEADY)
@@ -225,12 +220,14 @@ class ManagerNode(Node):
         node.state = State.PRIMARY_STATE_UNKNOWN
         self.health.error(f"{node.name} does not answer")
 
-    def _summary(self) -> str:
+    def state_name(self) -> str:
+        """Name of the state of all, for the diagnostics."""
         if held := [node.name for node in self._nodes if node.held]:
             return f"held: {', '.join(held)}"
         return "active" if self._was_up else ("starting" if self._wanted_up else "shut down")
 
-    def _details(self) -> dict[str, str]:
+    def details(self) -> dict[str, str]:
+        """State of each node."""
         return {node.name: _NAMES.get(node.state, "in transition") for node in self._nodes}
 
 

@@ -19,12 +19,17 @@ from rclpy.serialization import deserialize_message
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.nodes.excitation_design import GRIDS, NO_RECORDS
+from tactile_resonance.nodes.excitation_design import NO_RECORDS
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.recording.messages import each_from_message, time_from_message, write_each
+from tactile_resonance.recording.messages import (
+    GRIDS,
+    each_from_message,
+    time_from_message,
+    write_each,
+)
 from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed, ScanEnded
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.point_file import offered_qos
@@ -82,7 +87,7 @@ class MeasureClient:
         goal = Measure.Goal(
             measurement_id=recording.measurement_id,
             label=label,
-            grid=next(number for number, grid in GRIDS.items() if grid is design.grid),
+            grid=GRIDS[design.grid],
             level_v=0.0 if design.silent else design.level_v,
             silent=design.silent,
             excited_low_hz=[low_hz for low_hz, _ in design.stretches_hz],

@@ -19,7 +19,7 @@ from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import ContactGoal
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.frf.band_bins import BandBins
@@ -71,9 +71,9 @@ CONTACT_FIGURES = (
 RosTime = Callable[[int], int]
 """From a time of the loop's clock [ns] to ROS time [ns]."""
 
-_HOLDS = {
-    MakeContact.Goal.HOLD_FORCE: HoldMode.FORCE,
-    MakeContact.Goal.HOLD_INDENTATION: HoldMode.INDENTATION,
+HOLDS = {
+    HoldMode.FORCE: MakeContact.Goal.HOLD_FORCE,
+    HoldMode.INDENTATION: MakeContact.Goal.HOLD_INDENTATION,
 }
 
 
@@ -209,11 +209,9 @@ def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: floa
     ValueError
         If its frame is not that of the base, the way to hold is unknown, or orientation or normal is invalid.
     """
-    if request.hold not in _HOLDS:
-        raise ValueError(f"hold: {request.hold}, accepted are {sorted(_HOLDS)}")
+    hold = key_of(HOLDS, request.hold, "hold")
     touch = touch_of(request, base_frame, ball_radius_m)
-    standoff_m = request.standoff_m or math.inf
-    return ContactGoal(touch, Aim(request.force_n, _HOLDS[request.hold]), standoff_m)
+    return ContactGoal(touch, Aim(request.force_n, hold), request.standoff_m or math.inf)
 
 
 def touch_of(
@@ -292,15 +290,15 @@ def tip_pose(time_ns: int, frame_id: str, position_m: Vector, rotation_rad: Vect
 
 
 def contact_state(
-    cycle: Cycle,
-    ros_ns: RosTime,
+    controller: State,
+    time_ns: int,
     estimate: ContactEstimate | None,
     result: ContactResult | None,
     frame_id: str,
 ) -> msg.ContactState:
     """What the controller does and knows, without the loop's counts."""
-    state = msg.ContactState(state=cycle.state.value, tissue_moves_m=math.nan)
-    state.header.stamp = time_message(ros_ns(cycle.time_ns))
+    state = msg.ContactState(state=controller.value, tissue_moves_m=math.nan)
+    state.header.stamp = time_message(time_ns)
     state.header.frame_id = frame_id
     state.force_n, state.depth_m, state.stiffness_n_per_m = _known(estimate)
     if result is not None:

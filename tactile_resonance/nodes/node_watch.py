@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -30,6 +31,9 @@ class _Sign:
     waiting_for: str = ""
     waiting_since_s: float = 0.0
 
+
+OF_OTHERS = _Sign("active", 0, math.inf)
+"""In place of the sign of life of a node that gives none."""
 
 Instances = dict[str, int]
 """Instance (one start of a node) at work, by the node's name."""
@@ -104,8 +108,7 @@ class NodeWatch:
     def changed(self, instances: Instances) -> str | None:
         """Why one of these is not at work any more, as a sentence; None: all are."""
         for name, instance in instances.items():
-            sign = self._signs.get(name)
-            if sign is not None and sign.instance != instance:
+            if self._signs[name].instance != instance:
                 return f"{name} was restarted"
             if problem := self._problem(name):
                 return problem
@@ -115,9 +118,7 @@ class NodeWatch:
         """One of these that is silent for a while, or waits for something itself, for people; empty: none."""
         now_s = time.monotonic()
         for name in instances:
-            sign = self._signs.get(name)
-            if sign is None:
-                continue
+            sign = self._signs[name]
             if now_s - sign.heard_s > SAID_AFTER_S:
                 return f"{name}, silent for {now_s - sign.heard_s:.0f} s"
             if sign.waiting_for and now_s - sign.waiting_since_s > SAID_AFTER_S:
@@ -135,13 +136,12 @@ class NodeWatch:
             raise
 
     def _deactivated(self, node: str) -> bool:
-        sign = self._signs.get(node)
-        return sign is not None and sign.state == "inactive" and not self._silence(node)
+        return self._sign(node).state == "inactive" and not self._silence(node)
 
     def _problem(self, node: str) -> str:
         """Why a node is not at work; empty where it is."""
-        sign = self._signs.get(node)
-        if sign is None or sign.state == "active":
+        sign = self._sign(node)
+        if sign.state == "active":
             return self._silence(node)
         if sign.state == DOUBTED:
             return f"{node} has given no sign of life again yet"
@@ -149,16 +149,16 @@ class NodeWatch:
 
     def _silence(self, node: str) -> str:
         """A node, or what it waits for, is silent for too long, as a sentence; empty where neither is."""
-        sign = self._signs.get(node)
-        if sign is None:
-            return ""
-        now_s = time.monotonic()
+        sign, now_s = self._sign(node), time.monotonic()
         silent_s, waiting_s = now_s - sign.heard_s, now_s - sign.waiting_since_s
         if silent_s > self._silent_s:
             return f"{node} is silent for {silent_s:.1f} s"
         if sign.waiting_for and waiting_s > self._silent_s:
             return f"{node} waits for {sign.waiting_for}, which is silent for {waiting_s:.1f} s"
         return ""
+
+    def _sign(self, node: str) -> _Sign:
+        return self._signs.get(node, OF_OTHERS)
 
     def _publishers(self, topic: str) -> set[str]:
         """Names of the nodes that publish a topic."""
@@ -170,11 +170,9 @@ class NodeWatch:
         return found
 
     def _on_beat(self, message: msg.Heartbeat) -> None:
-        now_s, since_s = time.monotonic(), 0.0
-        before = self._signs.get(message.node)
-        if message.waiting_for:
-            same = before is not None and before.waiting_for == message.waiting_for
-            since_s = before.waiting_since_s if same and before is not None else now_s
+        before, now_s = self._sign(message.node), time.monotonic()
+        same = before.waiting_for == message.waiting_for
+        since_s = before.waiting_since_s if same else now_s
         self._signs[message.node] = _Sign(
             message.state, message.instance, now_s, message.waiting_for, since_s
         )

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from rcl_interfaces.msg import (
@@ -22,7 +23,7 @@ from tactile_resonance.contact.samples import Pose
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a node.
+    """One parameter of a node, which may be set while it runs.
 
     Attributes
     ----------
@@ -34,8 +35,6 @@ class Parameter:
         Range of a number, ends included.
     choices : tuple of str
         What a string may be; any where empty.
-    read_only : bool
-        Only the launch decides.
     """
 
     name: str
@@ -44,7 +43,7 @@ class Parameter:
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] = ()
-    read_only: bool = False
+    read_only: ClassVar[bool] = False
 
     def descriptor(self) -> ParameterDescriptor:
         """What `ros2 param describe` shows; ROS itself enforces the range."""
@@ -61,6 +60,12 @@ class Parameter:
                     FloatingPointRange(from_value=float(self.low), to_value=float(self.high))
                 ]
         return descriptor
+
+
+class Fixed(Parameter):
+    """One that only the launch decides."""
+
+    read_only = True
 
 
 def declare(node: Node, parameters: Sequence[Parameter]) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from tactile_resonance import msg
@@ -18,8 +17,8 @@ from tactile_resonance.configuration import shared_file
 from tactile_resonance.fields import build, counted, numbers, require
 from tactile_resonance.nodes.frames import BROADCAST_TF, TipBroadcaster
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.parameters import Parameter, pose_of, values
-from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES, run_node
+from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
+from tactile_resonance.nodes.running import LATCHED, POINT_RESULTS, POLES
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.level_set import Boundary, LevelSet
 from tactile_resonance.scan.map_messages import (
@@ -40,37 +39,33 @@ from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import read_classes
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "source",
         "point_result",
         "What is on the map: the points of tissue that a scan accepts (point_result), or the latest poles "
         "of every place, whoever measured them and whatever for (poles).",
         choices=("point_result", "poles"),
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "frame_id",
         "",
         "Frame of the map; poles in another one than this and base_frame are left out. Empty: that of the "
         "first poles.",
-        read_only=True,
     ),
-    Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
-    Parameter(
+    Fixed("base_frame", "base", "Frame of the robot's base."),
+    Fixed(
         "table_in_base",
         [0.0] * 6,
         "Pose of frame_id in base_frame, position [m] and rotation vector [rad], that of scan_node: where "
         "frame_id is given, poles in base_frame are shown in it.",
-        read_only=True,
     ),
-    Parameter("tip_frame", "tip", "Frame of the tip that is broadcast.", read_only=True),
+    Fixed("tip_frame", "tip", "Frame of the tip that is broadcast."),
     BROADCAST_TF,
-    Parameter(
+    Fixed(
         "classes_file",
         "",
         "YAML file with tissue_classes and their nominal_contact, a scene for example; empty: no tissue is "
         "called.",
-        read_only=True,
     ),
     Parameter(
         "unknown_level",
@@ -100,27 +95,24 @@ PARAMETERS = (
         0.0,
         1e6,
     ),
-    Parameter(
+    Fixed(
         "band",
         1,
         "Of measurements in several bands the one that is mapped, in the order of the scene; tissue is "
         "called from the first only.",
         1,
         100,
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "boundary_f0_hz",
         [0.0, 0.0],
         "The boundary of what lies between two frequencies [Hz] is drawn, with the band that holds it (95 %); "
         "0: none on that side, both: no boundary.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "adaptive_scene",
         "",
         "Scene with adaptive positions whose boundary is drawn as its scan finds it; empty: boundary_f0_hz.",
-        read_only=True,
     ),
     Parameter("surface_cells", 40, "Cells along the longer side of the surface.", 4, 200),
 )
@@ -182,10 +174,9 @@ class PoleMapNode(ManagedNode):
             "point_result": (msg.PointResult, self._on_result, POINT_RESULTS),
             "poles": (msg.Poles, self._on_poles, POLES),
         }[source]
-        subscription = self.create_subscription(kind, source, callback, qos)
-        self.resources.callback(self.destroy_subscription, subscription)
+        self.listen(kind, source, callback, qos, always=True)
         TipBroadcaster(self, *values(self, "tip_frame"))
-        self.serve(Trigger, "pole_map/clear", self._on_clear)
+        self.serve_trigger("pole_map/clear", self._clear)
         # the frame may be known from now on only
         self.every(REPEAT_PERIOD_S, lambda: self._show(repeat=True))
 
@@ -202,7 +193,6 @@ class PoleMapNode(ManagedNode):
         }
 
     def _on_poles(self, message: msg.Poles) -> None:
-        self.health.saw("poles")
         point = self._point(message)
         if point is not None:
             self._grown.add(point)
@@ -210,7 +200,6 @@ class PoleMapNode(ManagedNode):
 
     def _on_result(self, message: msg.PointResult) -> None:
         """The latest result of a point of tissue that is not discarded replaces what was there before."""
-        self.health.saw("point_result")
         result = from_message(message)
         if not counts(result):
             return
@@ -260,12 +249,10 @@ class PoleMapNode(ManagedNode):
             return None
         return point
 
-    def _on_clear(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.message = f"{counted(len(self._grown), 'point')} cleared"
-        response.success = True
-        self._grown = GrowingMap()
+    def _clear(self) -> str:
+        cleared, self._grown = len(self._grown), GrowingMap()
         self._renew()
-        return response
+        return f"{counted(cleared, 'point')} cleared"
 
     def _renew(self) -> None:
         """Show the map, which is another than before."""
@@ -343,10 +330,7 @@ def _boundary_of(
     return lambda pole_map: adaptive.boundary(pole_map.placed)
 
 
-def main() -> None:
-    """Console script."""
-    run_node(PoleMapNode)
-
+main = PoleMapNode.run
 
 if __name__ == "__main__":
     main()

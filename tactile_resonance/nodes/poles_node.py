@@ -11,8 +11,8 @@ from tactile_resonance.calibration.file import read_calibration
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import frf_from_message, poles_to_message
-from tactile_resonance.nodes.parameters import Parameter, values
-from tactile_resonance.nodes.running import POLES, RESULTS, run_node
+from tactile_resonance.nodes.parameters import Fixed, Parameter, values
+from tactile_resonance.nodes.running import POLES, RESULTS
 from tactile_resonance.poles.compiled import compiled
 from tactile_resonance.poles.estimator import POLES_METHODS, poles_of_bands
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -52,12 +52,11 @@ PARAMETERS = (
         "the FRF brings the bins.",
         choices=POLES_METHODS,
     ),
-    Parameter(
+    Fixed(
         "calibration",
         "",
         "File of `tactile_resonance calibrate`: poles of the first band through this sensor, from rest; where "
         "data contradict it, or lines outside of the band are excited, as without. Empty: none.",
-        read_only=True,
     ),
 )
 
@@ -105,10 +104,7 @@ class PolesNode(ManagedNode):
         return calibrated_poles(frf, bands, self._sensor, force_n, force_std_n, method)
 
 
-def main() -> None:
-    """Console script."""
-    run_node(PolesNode)
-
+main = PolesNode.run
 
 if __name__ == "__main__":
     main()

@@ -12,12 +12,7 @@ from typing import Any
 
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    NameValidationException,
-    ParameterException,
-)
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -125,9 +120,8 @@ def run_node(make: Callable[[], Node]) -> None:
         # the interpreter, as it ends, takes handlers away
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     except (
-        *(ValueError, OSError, DeviceError, ParameterException),
-        *(InvalidParameterValueException, InvalidParameterTypeException, NameValidationException),
-        RCLError,
+        *(ValueError, OSError, DeviceError),
+        *(ParameterException, NameValidationException, RCLError),
     ) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)

@@ -11,36 +11,26 @@ from rclpy.executors import ExternalShutdownException
 from tactile_resonance.action import Scan
 from tactile_resonance.client import Ending, ScanOutcome
 from tactile_resonance.nodes.client import NoAnswer, ScanClient
-from tactile_resonance.nodes.parameters import Parameter, declare, values
+from tactile_resonance.nodes.parameters import Fixed, declare, values
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "scene",
         "config/scenes/demo.yaml",
         "Scene file, absolute or in the package's share folder.",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "run_directory",
         "",
         "New or empty folder of the run, or the run to continue; empty: made by scan_node.",
-        read_only=True,
     ),
-    Parameter("resume", False, "Go on with the run in run_directory.", read_only=True),
-    Parameter(
+    Fixed("resume", False, "Go on with the run in run_directory."),
+    Fixed(
         "notes",
         "",
         "Of the session, in place of the scene's: {temperature_c: 21.5, tip_wetness: wet}.",
-        read_only=True,
     ),
-    Parameter(
-        "start_within_s",
-        120.0,
-        "Longest wait for the nodes to come up [s].",
-        1.0,
-        3600.0,
-        read_only=True,
-    ),
+    Fixed("start_within_s", 120.0, "Longest wait for the nodes to come up [s].", 1.0, 3600.0),
 )
 QUIET = (
     Scan.Feedback.PHASE_SURFACE,

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -24,6 +24,7 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.measure_client import MeasureClient
 from tactile_resonance.nodes.messages import pose_to_message
 from tactile_resonance.nodes.node_watch import Instances, NodeWatch
+from tactile_resonance.nodes.parameters import values
 from tactile_resonance.nodes.running import PLACES
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
@@ -74,10 +75,9 @@ class NodeHands:
     Parameters
     ----------
     node : ManagedNode
-    base_frame : str
-        Name of the robot's base.
-    with_robot : bool
-        False: the tip is not moved; it is taken to be where the plan states, and its pose is published.
+        Where its parameter ``contact`` is none the tip is not moved; it is taken to be where the plan states,
+        and its pose is published.
+    scan_time : ScanTime
     tell_waiting : callable
         Called in the scan's thread with the node that keeps the scan waiting, for people; empty: none any more.
 
@@ -92,39 +92,27 @@ class NodeHands:
     """
 
     def __init__(
-        self,
-        node: ManagedNode,
-        base_frame: str,
-        with_robot: bool,
-        scan_time: ScanTime,
-        tell_waiting: Callable[[str], None],
+        self, node: ManagedNode, scan_time: ScanTime, tell_waiting: Callable[[str], None]
     ) -> None:
-        self._node = node
+        self._node, self._time, self._tell_waiting = node, scan_time, tell_waiting
         self.frame_in_base = Pose.at_origin()
         self.standoffs = Standoffs(Plane())
-        self._base_frame = base_frame
-        self._time = scan_time
-        self.free_air = with_robot
-        self._tell_waiting = tell_waiting
+        contact, self._base_frame = values(node, "contact", "base_frame")
+        self.free_air = contact == "robot"
         self._measure = MeasureClient(node, scan_time)
         self._tip: TipContact | None = None
-        if with_robot:
+        if self.free_air:
             self._tip = TipContact(node, scan_time, self._end_if_hung)
             self._parameters = node.client_of(GetParameters, "contact_node/get_parameters")
         else:
             self._pose = node.publish_on(PoseStamped, "tcp_pose", PLACES)
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
+    def listening(self) -> AbstractContextManager[None]:
         """Subscribe to what a scan needs while there is one: idle, each message would cost as much.
 
         To be entered and left in the executor's thread.
         """
-        stop = self._node.set_up(self._listen)
-        try:
-            yield
-        finally:
-            stop()
+        return self._node.with_set_up(self._listen)
 
     def _listen(self) -> None:
         self._waited_for = ""
@@ -238,13 +226,13 @@ class NodeHands:
         told = [parameter_value_to_python(value) for value in answer.values]
         if len(told) != len(TIP_NAMES) or None in told:
             return None
-        values = dict(zip((name.rpartition(".")[2] for name in TIP_NAMES), told, strict=True))
+        given = dict(zip((name.rpartition(".")[2] for name in TIP_NAMES), told, strict=True))
         described = sensor_named(sensor)
         ball, beam = described.tip.radius_m, described.beam.free_length_m
         return TipUse(
-            TipGeometry(ball, beam, **{name: values[name] for name in TIP_GEOMETRY}),
-            ContactParameters(**{name: values[name] for name in TIP_PARAMETERS}),
-            Limits(**{name: values[name] for name in TIP_LIMITS}),
+            TipGeometry(ball, beam, **{name: given[name] for name in TIP_GEOMETRY}),
+            ContactParameters(**{name: given[name] for name in TIP_PARAMETERS}),
+            Limits(**{name: given[name] for name in TIP_LIMITS}),
         )
 
     def offers_tests(self) -> bool:

@@ -26,8 +26,8 @@ from tactile_resonance.nodes.managed_node import (
     end_goal,
     in_thread,
 )
-from tactile_resonance.nodes.parameters import Parameter, pose_of, values
-from tactile_resonance.nodes.running import POINT_RESULTS, run_node
+from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
+from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_actions import (
     calibrate,
     calibration_request,
@@ -49,41 +49,36 @@ from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.table_calibration import CalibrationRequest
 
 PARAMETERS = (
-    Parameter(
+    Fixed(
         "contact",
         "robot",
         "What brings the tip to the tissue: contact_node, or nothing (the tip is taken to be where the plan "
         "states, and its pose is published).",
         choices=("robot", "none"),
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "table_in_base",
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         "The table in the robot's base: position [m] and rotation vector [rad].",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "table_frame",
         "table",
         "Frame of the table: of poses without a scene, and of scenes that name none.",
-        read_only=True,
     ),
-    Parameter("base_frame", "base", "Frame of the robot's base.", read_only=True),
+    Fixed("base_frame", "base", "Frame of the robot's base."),
     BROADCAST_TF,
-    Parameter(
+    Fixed(
         "run_folder",
         "",
         "Folder of the runs that name none; empty: tactile_resonance/runs in $ROS_HOME (~/.ros where "
         "that is not set).",
-        read_only=True,
     ),
-    Parameter(
+    Fixed(
         "goal_folders",
         [""],
         "Folders in which files and run folders of goals may be, beside the package's scenes and run_folder; "
         "/ for any.",
-        read_only=True,
     ),
     Parameter("seed", 1, "Seed of the phases of the first point.", 1, 2**62),
     TIME_SERVER,
@@ -108,9 +103,8 @@ class OneGoal:
     Parameters
     ----------
     node : ManagedNode
-        Whose actions and service they are, until it is cleaned up.
-    rejection : str
-        Name of the service that has the reason: rclpy has no place for it in its answer to a goal.
+        Whose actions they are, until it is cleaned up, and whose service ``scan/rejection`` has the reason:
+        rclpy has no place for it in its answer to a goal.
     around : callable
         Context of the work, entered and left in the executor's thread.
 
@@ -123,13 +117,13 @@ class OneGoal:
     """
 
     def __init__(
-        self, node: ManagedNode, rejection: str, around: Callable[[], AbstractContextManager[None]]
+        self, node: ManagedNode, around: Callable[[], AbstractContextManager[None]]
     ) -> None:
         self._node, self._around = node, around
         self.handle: ServerGoalHandle | None = None
         self.controls: Controls | None = None
         self._asked = self._rejection = ""
-        node.serve(Trigger, rejection, self._on_rejection)
+        node.serve(Trigger, "scan/rejection", self._on_rejection)
 
     def act(
         self,
@@ -157,7 +151,7 @@ class OneGoal:
         """
         found: dict[int, Any] = {}  # by the check of a goal, by its message
 
-        async def refusal(message: Any) -> str:
+        async def refuses(message: Any) -> bool:
             self._asked = asked = str(message)
             reason = ""
             try:
@@ -170,7 +164,7 @@ class OneGoal:
                 self._node.get_logger().warning(f"goal rejected: {reason}")
             if self._asked == asked:  # no other came while this one was checked
                 self._rejection = reason
-            return reason
+            return bool(reason)
 
         async def serve(goal: ServerGoalHandle) -> Any:
             checked = found.pop(id(goal.request))
@@ -188,7 +182,7 @@ class OneGoal:
             end_goal(goal, result.outcome == done)
             return result
 
-        self._node.act(kind, name, serve, lambda _: self.cancel(), refusal)
+        self._node.act(kind, name, serve, lambda _: self.cancel(), refuses)
 
     def serve_control(self, name: str, ask: Callable[[Controls], None]) -> None:
         """Service that asks something of the goal that is worked at."""
@@ -231,18 +225,17 @@ class ScanNode(ManagedNode):
 
     def configure(self) -> None:
         """Offer the actions; the topics are subscribed to when a scan begins."""
-        names = ("contact", "table_in_base", "table_frame", "base_frame")
-        contact, table, table_frame, base_frame = values(self, *names)
+        names = ("table_in_base", "table_frame", "base_frame")
+        table, table_frame, base_frame = values(self, *names)
         self._frames = Frames(table_frame, base_frame, pose_of(table, "table_in_base"))
         self._time = ScanTime(self.time_server, self.hung_after_s)
-        robot = contact == "robot"
-        self._hands = NodeHands(self, base_frame, robot, self._time, self._tell_waiting)
+        self._hands = NodeHands(self, self._time, self._tell_waiting)
         broadcast_fixed(self, base_frame, {table_frame: self._frames.table_in_base})
         self._files = GoalFiles(*values(self, "run_folder", "goal_folders"))
         self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
         self._run_directory = ""
         self._told: tuple[Phase, str, float] | None = None
-        goals = self._goals = OneGoal(self, "scan/rejection", self._hands.listening)
+        goals = self._goals = OneGoal(self, self._hands.listening)
         for name, ask in CONTROLS.items():
             goals.serve_control(name, ask)
         done, busy = Scan.Result.COMPLETE, Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
@@ -384,10 +377,7 @@ class ScanNode(ManagedNode):
             goal.publish_feedback(scan_feedback(progress, self._run_directory))
 
 
-def main() -> None:
-    """Console script."""
-    run_node(ScanNode)
-
+main = ScanNode.run
 
 if __name__ == "__main__":
     main()

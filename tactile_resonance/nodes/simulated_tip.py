@@ -6,22 +6,23 @@ The true poles there are on the topic `bench/truth` and behind the service `benc
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from tactile_resonance import msg
 from tactile_resonance.contact.force_spread import ForceSpread
+from tactile_resonance.contact.vectors import Vector, vector
 from tactile_resonance.nodes.bench_player import PlantChild
-from tactile_resonance.nodes.ideal_contact import IdealContact, Stay, Stays, pressing
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.messages import poles_to_message, pose_to_message
+from tactile_resonance.nodes.messages import poles_to_message, pose_to_message, write_force_over
 from tactile_resonance.nodes.parameters import pose_of, values
 from tactile_resonance.nodes.running import PLACES, STREAM, TRUTHS
-from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.recording.messages import (
@@ -39,7 +40,66 @@ from tactile_resonance.srv import ForceOver
 from tactile_resonance.srv import Truth as TruthService
 
 PLANT_CHECK_S = 0.5
-CLEAR_M = 0.05  # above the table: where an ideal contact's tip is before its first goal
+MOST_STAYS = 1000
+
+
+@dataclass(frozen=True)
+class Stay:
+    """The tip somewhere, from a time on.
+
+    Attributes
+    ----------
+    since_ns : int
+        ROS time [ns].
+    force_n : float
+        0 in air.
+    pose : PoseStamped
+        With an empty frame where it is unknown.
+    """
+
+    since_ns: int
+    force_n: float
+    pose: PoseStamped
+
+
+class Stays:
+    """Where the tip was and how hard it pressed, and what follows for an interval."""
+
+    def __init__(self) -> None:
+        self._stays: deque[Stay] = deque([Stay(0, 0.0, PoseStamped())], maxlen=MOST_STAYS)
+
+    @property
+    def newest(self) -> Stay:
+        """The present one."""
+        return self._stays[-1]
+
+    def add(self, stay: Stay) -> None:
+        """The tip is somewhere else from now on."""
+        self._stays.append(stay)
+
+    def serve(self, request: ForceOver.Request, response: ForceOver.Response) -> ForceOver.Response:
+        """The force over an interval, as the service `force_over` answers."""
+        start_ns, end_ns = time_from_message(request.start), time_from_message(request.end)
+        if not start_ns < end_ns:
+            return write_force_over(response, "the interval is empty")
+        spans: list[tuple[float, float]] = []  # length [ns], force
+        until_ns = end_ns
+        for stay in reversed(self._stays):
+            span_ns = max(0, until_ns - max(start_ns, stay.since_ns))
+            if span_ns:
+                spans.append((span_ns, stay.force_n))
+                response.tip_pose = stay.pose
+            until_ns = min(until_ns, stay.since_ns)
+        seen_ns = sum(span_ns for span_ns, _ in spans)
+        response.coverage = seen_ns / (end_ns - start_ns)
+        if until_ns > start_ns:
+            text = f"the block begins before what is kept, {MOST_STAYS} places"
+            return write_force_over(response, text)
+        mean_n = sum(span_ns * force_n for span_ns, force_n in spans) / seen_ns
+        square = sum(span_ns * (force_n - mean_n) ** 2 for span_ns, force_n in spans) / seen_ns
+        forces_n = [force_n for _, force_n in spans]
+        spread = ForceSpread(square**0.5, min(forces_n), max(forces_n))
+        return write_force_over(response, "", mean_n, 0.0, spread)
 
 
 class SimulatedTip:
@@ -52,11 +112,9 @@ class SimulatedTip:
     bench : SimulatedBench
     scene : PhantomScene
     plant : PlantChild or None
-        None: contact is ideal, by goals where the node's parameter says so, else where `tcp_pose` states.
+        None: contact is ideal, and the tip where it is placed, or where `tcp_pose` states.
     now_ns : callable
         ROS time now [ns].
-    stop : StopInput or None
-        Of the goals.
 
     Attributes
     ----------
@@ -64,6 +122,8 @@ class SimulatedTip:
     stays : Stays
     stalls : int
         How often the simulated robot stood still.
+    truths : publisher
+        Of `truth_message`.
     """
 
     def __init__(
@@ -73,44 +133,29 @@ class SimulatedTip:
         scene: PhantomScene,
         plant: PlantChild | None,
         now_ns: Callable[[], int],
-        stop: StopInput | None,
     ) -> None:
         self._node, self._bench, self._scene, self.plant = node, bench, scene, plant
-        self._now_ns = now_ns
-        table, self._frame_id, base_frame = values(node, "table_in_base", "frame_id", "base_frame")
+        self.now_ns = now_ns
+        table, self.frame_id = values(node, "table_in_base", "frame_id")
         self._laid = LaidScene(scene, pose_of(table, "table_in_base"))
         self.tip, self.stays, self.stalls = BenchTip(None, 0.0, 1.0), Stays(), 0
-        self._truths = node.publish_on(msg.Poles, "bench/truth", TRUTHS)
-        self._contact: IdealContact | None = None
+        self.truths = node.publish_on(msg.Poles, "bench/truth", TRUTHS)
         if plant is not None:
             node.every(PLANT_CHECK_S, self._check_plant)
-            return
-        if stop is not None:
-            table = self._laid.table
-            x, y, z = (table.position_m + table.rotation.apply([0.0, 0.0, CLEAR_M])).tolist()
-            place = Contact(position_m=(x, y, z), frame_id=base_frame)
-            self.stays.add(Stay(0, 0.0, pose_to_message(place)))
-            self._contact = IdealContact(
-                node,
-                self.stays,
-                self._found_at,
-                self._placed,
-                now_ns,
-                stop,
-                base_frame,
-                self._frame_id,
-            )
         else:
-            self._wrench = node.publish_on(WrenchStamped, "wrench", STREAM)
-            # a scan waits until the pose is received, which needs a reliable subscription; others publish
-            node.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
-            node.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
-        node.serve(ForceOver, "force_over", self.stays.serve)
+            node.serve(ForceOver, "force_over", self.stays.serve)
 
-    def draw_back(self) -> None:
-        """Lift the tip off, where goals put it."""
-        if self._contact is not None:
-            self._contact.draw_back()
+    def follow_poses(self) -> None:
+        """Be where `tcp_pose` states, and publish the force there on `wrench`."""
+        self._wrench = self._node.publish_on(WrenchStamped, "wrench", STREAM)
+        # a scan waits until the pose is received, which needs a reliable subscription; others publish
+        self._node.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
+        self._node.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
+
+    def above_table(self, height_m: float) -> Vector:
+        """Place in the base above the origin of the table [m]."""
+        table = self._laid.table
+        return vector(table.position_m + table.rotation.apply([0.0, 0.0, height_m]))
 
     def at(self, place_m: tuple[float, float, float]) -> BenchTip:
         """A tip at a place of the scene, at the scene's force."""
@@ -134,10 +179,9 @@ class SimulatedTip:
                 depth_m=true["depth_m"],
             )
         x, y, z = true["tip_m"]
-        place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self._now_ns())
+        place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self.now_ns())
         self._plant_ahead_s = true["time_s"] - place.time_ns * 1e-9
-        self.stays.add(Stay(place.time_ns, force_n, pose_to_message(place)))
-        self._put(tip)
+        self._put(Stay(place.time_ns, force_n, pose_to_message(place)), tip)
 
     def contact_over(self, from_ns: int, to_ns: int) -> list[ContactState | None]:
         """The contact over an interval, as fine as the sensor follows it; unchanged where the plant ended."""
@@ -152,23 +196,17 @@ class SimulatedTip:
         rows = zip(*(answer[name] for name in names), strict=True)
         return [None if row[0] is None else row for row in rows]
 
-    def tell_truth(
-        self,
-        pose: PoseStamped,
-        tip: BenchTip,
-        measurement_id: int = 0,
-        parts: Sequence[CoupledBimorph] = (),
-    ) -> None:
-        """Publish the exact poles of a tip at a pose; see `truth_message`."""
-        coupled = parts or [tip.coupled(self._bench)]
-        self._truths.publish(truth_message(pose, tip, coupled, measurement_id, self._frame_id))
-
-    def _put(self, tip: BenchTip) -> None:
+    def _put(self, stay: Stay, tip: BenchTip) -> None:
+        self.stays.add(stay)
         self.tip = tip
-        self.tell_truth(self.stays.newest.pose, tip)
+        coupled = [tip.coupled(self._bench)]
+        self.truths.publish(truth_message(stay.pose, tip, coupled, 0, self.frame_id))
 
-    def _found_at(self, place_m: np.ndarray, force_n: float) -> tuple[float, float] | None:
-        """Depth that brings a force at a place in the base, and height of the surface above that place."""
+    def found_at(self, place_m: np.ndarray, force_n: float) -> tuple[float, float] | None:
+        """Depth [m] that brings a force [N] at a place (3,) in the base [m], and the surface's height above it.
+
+        None where nothing is to be touched.
+        """
         tissue = self._laid.tissue_at(place_m)
         if tissue is None:
             return None
@@ -177,12 +215,11 @@ class SimulatedTip:
         height_m, _ = self._laid.surface().height_of(place_m)
         return float(contact.indentation_m), -float(height_m)
 
-    def _placed(self) -> None:
-        """The tip has been put somewhere by a goal."""
-        stay = self.stays.newest
+    def place(self, stay: Stay) -> None:
+        """Put the tip somewhere; in air where its force is 0."""
         point = stay.pose.pose.position
         tissue = self._laid.tissue_at(np.array([point.x, point.y, point.z]))
-        self._put(BenchTip(tissue if stay.force_n else None, stay.force_n, 1.0))
+        self._put(stay, BenchTip(tissue if stay.force_n else None, stay.force_n, 1.0))
 
     def _on_pose(self, message: PoseStamped) -> None:
         if message == self.stays.newest.pose:
@@ -190,10 +227,8 @@ class SimulatedTip:
         position = message.pose.position
         tip = self.at((position.x, position.y, position.z))
         tip = tip if tip.tissue else replace(tip, force_n=0.0)
-        self.stays.add(Stay(self._now_ns(), tip.force_n, message))
-        wrench = pressing(tip.force_n, message.header.stamp, self._frame_id)
-        self._wrench.publish(wrench)
-        self._put(tip)
+        self._wrench.publish(pressing(tip.force_n, message.header.stamp, self.frame_id))
+        self._put(Stay(self.now_ns(), tip.force_n, message), tip)
 
     def _check_plant(self) -> None:
         if self.plant is not None and not self.plant.alive:
@@ -272,3 +307,11 @@ def truth_to_response(
         response.relaxation_modulus_1s_pa = contact.tissue.relaxation_modulus_1s_pa
         stiffness = contact.dynamic_stiffness(2j * np.pi * frequency)
         fill_complex(response, "stiffness_", stiffness, "_n_per_m")
+
+
+def pressing(force_n: float, stamp: Time, frame_id: str) -> WrenchStamped:
+    """Wrench of a force along the normal."""
+    wrench = WrenchStamped()
+    wrench.header.stamp, wrench.header.frame_id = stamp, frame_id
+    wrench.wrench.force.z = force_n
+    return wrench

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
@@ -22,17 +20,17 @@ class StopInput:
     Parameters
     ----------
     node : ManagedNode
-    draw_back : callable
-        Called with each request to stop.
 
     Attributes
     ----------
     stopped : bool
+    draw_back : callable
+        Called with each request to stop.
     """
 
-    def __init__(self, node: ManagedNode, draw_back: Callable[[], None]) -> None:
-        self.stopped = False
-        self._node, self._draw_back = node, draw_back
+    def __init__(self, node: ManagedNode) -> None:
+        self.stopped, self.draw_back = False, lambda: None
+        self._node = node
         node.create_service(SetBool, STOP, self._on_request)
         node.create_subscription(Bool, STOP, lambda message: self._set(message.data), 10)
 
@@ -51,4 +49,4 @@ class StopInput:
             self._node.get_logger().warning("stopped" if stopped else "the stop is released")
         self.stopped = stopped
         if stopped:
-            self._draw_back()
+            self.draw_back()

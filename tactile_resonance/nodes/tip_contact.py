@@ -36,6 +36,8 @@ from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
 
 STATE_TOPIC = "contact_state"
+UNKNOWN = msg.ContactState(tissue_moves_m=math.nan, zero_moved_n=math.nan)
+"""Before contact_node has told a state that counts."""
 TOUCH_RETRACT_WITHIN_S = 20.0  # after a touch of a surface that is searched for
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
@@ -91,7 +93,7 @@ class TipContact:
         self.touched_ns: int | None = None
         self._held_ns = 0  # when the contact was first seen to be held
         self._stop_asked_s = 0.0
-        self._state: msg.ContactState | None = None
+        self._state = UNKNOWN
         self._times, self._low = StateTimes(), False
         # the newest only: the recorder's may have to wait behind what else is recorded
         # always: a scan that the node's deactivation ends still draws the tip back
@@ -105,7 +107,7 @@ class TipContact:
     @property
     def tissue_moves_m(self) -> float:
         """Half the way of tissue that the tip follows while it holds its force [m]; NaN: none is seen."""
-        return math.nan if self._state is None else self._state.tissue_moves_m
+        return self._state.tissue_moves_m
 
     def hold(
         self,
@@ -122,10 +124,10 @@ class TipContact:
         goal.standoff_m = standoff_m if self._low else 0.0
         goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
         result, poll = self._make(goal, check, poll), self._going(poll)
-        while (state := self._state) is None or state.state != state.STATE_HOLD:
+        while (state := self._state).state != state.STATE_HOLD:
             poll()
             check()
-            if state is not None and state.cause not in ("", Cause.NONE.value):
+            if state.cause not in ("", Cause.NONE.value):
                 raise self.failure(state)
             time.sleep(POLL_S)
         self.touched_ns = self._held_ns - round(result.contact_s * 1e9)
@@ -184,14 +186,10 @@ class TipContact:
                 msg.ContactState.STATE_IDLE, ASK_AGAIN_S
             ):
                 self.touching, self.touched_ns = False, None
-                moved_n = math.nan if self._state is None else self._state.zero_moved_n
+                moved_n = self._state.zero_moved_n
                 return 0.0 if math.isnan(moved_n) else moved_n
             state = self._state
-            if (
-                state is not None
-                and state.cause == Cause.HELD.value
-                and state.state == state.STATE_FAULT
-            ):
+            if state.cause == Cause.HELD.value and state.state == state.STATE_FAULT:
                 raise ScanEnded(f"the tip is held: {state.message}")
         raise ScanEnded(
             f"the tip was not drawn back within {within_s:g} s: is contact_node active?"
@@ -211,7 +209,7 @@ class TipContact:
     def check(self) -> None:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""
         state = self._state
-        if self.touching and state is not None and state.state != state.STATE_HOLD:
+        if self.touching and state.state not in (UNKNOWN.state, state.STATE_HOLD):
             raise self.failure(state)
 
     def _make(self, goal: MakeContact.Goal, check: Check, poll: Poll) -> MakeContact.Result:
@@ -227,10 +225,10 @@ class TipContact:
         """Result of a goal, from a tip that is free."""
         # a contact that a scan before this one left is ended first
         state = self._state
-        self.touching = self.touching or (state is not None and state.state != state.STATE_IDLE)
+        self.touching = self.touching or state.state not in (UNKNOWN.state, state.STATE_IDLE)
         self.retract()
         self.touching = True
-        self._state = None
+        self._state = UNKNOWN
         self._times.begin()
         self._time.go()
         poll = self._going(poll)
@@ -252,7 +250,7 @@ class TipContact:
         )
         if answer is None:
             return False
-        self._state = None
+        self._state = UNKNOWN
         if not answer.success:
             time.sleep(0.05)
         return answer.success
@@ -261,8 +259,7 @@ class TipContact:
         """Whether contact_node reports a state within a time; idle: that the tip is free."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
-            state = self._state
-            if state is not None and state.state == wanted:
+            if self._state.state == wanted:
                 return True
             time.sleep(POLL_S)
         return False
@@ -270,9 +267,7 @@ class TipContact:
     def _on_state(self, message: msg.ContactState) -> None:
         before, stamp_ns = self._state, time_from_message(message.header.stamp)
         self._times.take(message.state, stamp_ns)
-        if message.state == message.STATE_HOLD and (
-            before is None or before.state != message.state
-        ):
+        if message.state == message.STATE_HOLD and before.state != message.state:
             self._held_ns = stamp_ns
         self._state = message  # last: whoever sees that it is held reads since when
         if not self.stopped or message.stopped or message.instance == self._instance:
@@ -286,16 +281,11 @@ class TipContact:
         """What to raise for a contact that was not reached, or that ended."""
         if self.stopped and ended.cause == Cause.CANCELLED.value:
             return Stopped()
-        return _failure(ended)
-
-
-def _failure(ended: MakeContact.Result | Indent.Result | msg.ContactState) -> PointFailed:
-    """What a contact that was not reached, or that ended, means for the point."""
-    text = f"contact: {ended.cause}: {ended.message}"
-    if ended.cause in FOREIGN_CAUSES:
-        return PointDisturbed(text, ended.cause)
-    if ended.cause == Cause.SURFACE_MISSING.value:
-        return SurfaceMissing(text)
-    if ended.cause == Cause.SURFACE_EARLY.value:
-        return SurfaceEarly(text)
-    return PointFailed(text)
+        text = f"contact: {ended.cause}: {ended.message}"
+        if ended.cause in FOREIGN_CAUSES:
+            return PointDisturbed(text, ended.cause)
+        if ended.cause == Cause.SURFACE_MISSING.value:
+            return SurfaceMissing(text)
+        if ended.cause == Cause.SURFACE_EARLY.value:
+            return SurfaceEarly(text)
+        return PointFailed(text)

@@ -60,7 +60,7 @@ class Listener:
     Attributes
     ----------
     node : Node
-        On which subscriptions, publishers and timers are made, before or after `start`.
+        On which subscriptions, publishers and timers are made.
     """
 
     def __init__(self, beside: Node) -> None:
@@ -76,17 +76,13 @@ class Listener:
         self._executor = SingleThreadedExecutor(context=beside.context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, name="listener", daemon=True)
-
-    def start(self) -> None:
-        """Spin from now on."""
         self._thread.start()
 
     def close(self) -> None:
         """Spin no more; all that was made on the node ends."""
         self._executor.shutdown()
-        if self._thread.is_alive():
-            # where the context is being shut down, that holds what the thread waits for
-            self._thread.join(CLOSE_WITHIN_S)
+        # not for ever: where the context is being shut down, that holds what the thread waits for
+        self._thread.join(CLOSE_WITHIN_S)
         self.node.destroy_node()
 
     def _spin(self) -> None:
@@ -126,6 +122,7 @@ class TwistArm:
     def __init__(self, node: ManagedNode, config: TwistConfig, base_frame: str) -> None:
         self.config, self._base_frame = config, base_frame
         self.listener = Listener(node)
+        node.resources.callback(self.listener.close)
         self._lockstep = Lockstep(self.listener.node, self._publish) if config.lockstep else None
         self.clock: Clock = self._lockstep or WallClock()
         self._arrivals = Arrivals()
@@ -140,11 +137,9 @@ class TwistArm:
         self._moving = False
         self._following = Following(config)
         own = self.listener.node
-        node.resources.callback(self.listener.close)
         self._publisher = own.create_publisher(TwistStamped, config.command_topic, COMMANDS)
         own.create_subscription(PoseStamped, config.pose_topic, self._on_pose, SERIES)
         own.create_timer(config.max_command_gap_s / 2, self._watch_commands, clock=STEADY)
-        self.listener.start()
 
     # the contract
 

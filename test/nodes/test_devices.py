@@ -31,7 +31,7 @@ def make():
         node = rclpy.create_node("owner", parameter_overrides=given)
         declare(node, devices.PARAMETERS)
         try:
-            return devices.make_device(node)
+            return devices.make_device(node)[0]
         finally:
             node.destroy_node()
 
@@ -58,7 +58,7 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
         def close(self):
             closed.append(True)
 
-    monkeypatch.setattr(devices, "make_device", lambda _: Device())
+    monkeypatch.setattr(devices, "make_device", lambda _: (Device(), ()))
     with initialised(domain_id=free_domain_id(os.environ)):
         node = ExcitationNode()
         node.trigger_configure()
@@ -67,7 +67,7 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
 
 
 def test_records_go_where_the_parameter_says(tmp_path):
-    store = devices.open_store(str(tmp_path / "mine"), "bench", {})
+    store = devices.open_store(str(tmp_path / "mine"), "bench")
     assert store.folder == tmp_path / "mine"
     assert not store.folder.exists()  # made by the first measurement
 
@@ -75,19 +75,21 @@ def test_records_go_where_the_parameter_says(tmp_path):
 def test_records_go_to_ros_home_by_default(tmp_path, monkeypatch):
     parent = tmp_path / "ros" / "tactile_resonance" / "records"
     # two nodes in the same second do not share a folder
-    folders = [devices.open_store("", "bench", {"ROS_HOME": str(tmp_path / "ros")}).folder]
-    folders += [devices.open_store("", "nidaqmx", {"ROS_HOME": str(tmp_path / "ros")}).folder]
+    monkeypatch.setenv("ROS_HOME", str(tmp_path / "ros"))
+    folders = [devices.open_store("", device).folder for device in ("bench", "nidaqmx")]
     assert sorted(parent.iterdir()) == sorted(folders)
     assert len(set(folders)) == 2
     assert re.fullmatch(r"\d{8}T\d{6}Z(-\d+)?", folders[0].name)
+    monkeypatch.delenv("ROS_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
-    store = devices.open_store("", "bench", {})
+    store = devices.open_store("", "bench")
     assert store.folder.parent == tmp_path / ".ros" / "tactile_resonance" / "records"
 
 
-def test_a_replay_is_on_disk_already(tmp_path):
-    assert devices.open_store("", "replay", {"ROS_HOME": str(tmp_path)}) is None
-    assert devices.open_store(str(tmp_path / "copy"), "replay", {}).folder == tmp_path / "copy"
+def test_a_replay_is_on_disk_already(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROS_HOME", str(tmp_path))
+    assert devices.open_store("", "replay") is None
+    assert devices.open_store(str(tmp_path / "copy"), "replay").folder == tmp_path / "copy"
     assert list(tmp_path.iterdir()) == []
 
 

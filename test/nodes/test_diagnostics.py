@@ -21,11 +21,11 @@ def test_how_long_messages_kept_the_node_is_told_once_for_each_report(monkeypatc
     told = []
     with initialised(domain_id=free_domain_id(os.environ)):
         node = rclpy.create_node("health")
-        health = Health(node, lambda: "active", dict)
+        node.state_name, node.details = lambda: "active", dict
+        health = Health(node)
         monkeypatch.setattr(health._publisher, "publish", told.append)
         for seconds in (0.002, 0.003, 0.010):
-            health.saw("record")
-            health.took("record", seconds)
+            health.saw("record", seconds)
         health._publish()
         health._publish()  # nothing came since
         node.destroy_node()

@@ -27,9 +27,10 @@ from tactile_resonance.srv import ForceOver
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.nodes import ideal_contact, managed_node
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
-from tactile_resonance.nodes.ideal_contact import CONTACT_S, MOST_STAYS, Stay, Stays
+from tactile_resonance.nodes.ideal_contact import CONTACT_S
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import STREAM, initialised
+from tactile_resonance.nodes.simulated_tip import MOST_STAYS, Stay, Stays
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE

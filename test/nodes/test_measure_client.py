@@ -18,6 +18,7 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.measure_client import ScanRecorder
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, initialised
+from tactile_resonance.nodes.simulated_tip import truth_message
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.point_file import read_messages
@@ -59,10 +60,11 @@ def nodes():
 
 def tell(bench, number):
     """As `bench._play` does, when blocks end close together."""
+    tip = BenchTip(None, 0.0, 1.0)
     for k in range(number):
         pose = PoseStamped()
         pose.header.stamp = time_message(1000 + k)
-        bench._touch.tell_truth(pose, BenchTip(None, 0.0, 1.0), KEY)
+        bench._touch.truths.publish(truth_message(pose, tip, [tip.coupled(bench._bench)], KEY, "tip"))
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -76,7 +78,7 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
     with RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run:
         with run.begin_point(0) as recording:
             with recorder.recording(recording, KEY):
-                assert spin_until(executor, bench._touch._truths.get_subscription_count)
+                assert spin_until(executor, bench._touch.truths.get_subscription_count)
                 if not late:
                     tell(bench, TRUTHS)
                 assert spin_until(executor, lambda: recorder._counts["bench/truth"] >= TRUTHS)

@@ -13,6 +13,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 import rclpy
 from rclpy.serialization import serialize_message
+from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.cli import main
@@ -130,7 +131,7 @@ def test_a_replay_plays_the_run_again_bit_by_bit(run):
     with initialised(args=["--ros-args", *arguments], domain_id=free_domain_id(os.environ)):
         node = rclpy.create_node("replay_test")
         declare(node, PARAMETERS)
-        device = make_device(node)
+        device, _ = make_device(node)
         node.destroy_node()
     for key in (13, 11, 12):  # in the order in which they were taken
         excitation, records = measurement(key)
@@ -182,6 +183,8 @@ def test_analyze_takes_a_point_of_a_run(run, tmp_path, capsys):
 def test_numbers_of_the_core_are_the_constants_of_the_messages():
     for grid, number in messages.GRIDS.items():
         assert number == getattr(msg.Excitation, f"GRID_{grid.name}")
+        asked = getattr(Measure.Goal, f"GRID_{grid.name}", 0)  # 0: the node's parameter
+        assert asked == number
     for kind, number in messages.INPUT_KINDS.items():
         assert number == getattr(msg.Record, f"INPUT_{kind.name}")
     for between, number in messages.BETWEEN_SAMPLES.items():

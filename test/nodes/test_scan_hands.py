@@ -18,10 +18,10 @@ from rclpy.node import Node
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.nodes import scan_hands
 from tactile_resonance.nodes.contact_node import ContactNode
-from tactile_resonance.nodes.contact_parameters import read_parameters
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import poles_to_message
+from tactile_resonance.nodes.parameters import Fixed
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_time import ScanTime
@@ -37,15 +37,15 @@ from tactile_resonance.scan.surface import Plane
 from test.spinning import spin_until
 
 PLACE_M = (0.004, -0.003, 0.0)
+BASE = Fixed("base_frame", "base", ".")
 
 
 class Scanning(ManagedNode):
     def __init__(self):
-        super().__init__("scan_node", ())
+        super().__init__("scan_node", (Fixed("contact", "none", "."), BASE))
 
     def configure(self):
-        scan_time = ScanTime("", 60.0)
-        self.hands = NodeHands(self, "base", False, scan_time, lambda _: None)
+        self.hands = NodeHands(self, ScanTime("", 60.0), lambda _: None)
 
 
 @pytest.fixture
@@ -182,10 +182,10 @@ GIVEN_AS = ["--ros-args", *(word for k, v in GIVEN.items() for word in ("-p", f"
 
 class Asker(ManagedNode):
     def __init__(self):
-        super().__init__("scan_node", ())
+        super().__init__("scan_node", (Fixed("contact", "robot", "."), BASE))
 
     def configure(self):
-        self.hands = scan_hands.NodeHands(self, "base", True, ScanTime("", 60.0), print)
+        self.hands = NodeHands(self, ScanTime("", 60.0), print)
 
 
 @pytest.fixture
@@ -214,14 +214,15 @@ def ask(monkeypatch):
 
 def test_figures_are_those_of_contact_node(ask):
     use, node = ask(ContactNode)
-    parameters, limits = read_parameters(node)
+    settings = node._settings
+    settings.read()
     assert use.tip == TipGeometry(beam_tilt_rad=0.2)
     assert use.limits.depth_m == 3.5e-3
     assert use.parameters.standoff_m == 4e-3
     for name in scan_hands.TIP_LIMITS:
-        assert getattr(use.limits, name) == getattr(limits, name)
+        assert getattr(use.limits, name) == getattr(settings.limits, name)
     for name in scan_hands.TIP_PARAMETERS:
-        assert getattr(use.parameters, name) == getattr(parameters, name)
+        assert getattr(use.parameters, name) == getattr(settings.parameters, name)
 
 
 @pytest.mark.parametrize("name", ["contact_node", "another"])

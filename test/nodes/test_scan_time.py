@@ -16,7 +16,7 @@ from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.nodes.bench_player import BenchServer
 from tactile_resonance.nodes.node_watch import SILENT_S
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.nodes.tip_contact import TipContact
+from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact
 from tactile_resonance.scan.point_outcome import StateTimes
 
 SERVER = own_time(41)
@@ -72,7 +72,7 @@ def test_while_a_scan_conducts_each_go_lets_one_block_pass():
 def test_blocks_of_somebody_else_do_not_stop_the_time_of_a_contact():
     scan, ends = ScanTime(SERVER, 60.0), patience()
     tip = TipContact.__new__(TipContact)
-    tip._time, tip._times, tip._state, tip.touching = scan, StateTimes(), None, False
+    tip._time, tip._times, tip._state, tip.touching = scan, StateTimes(), UNKNOWN, False
     with device() as clock, scan.conducted():
         begun_ns = clock.ask_ns()
 

@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from tactile_resonance import msg
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.messages import time_message
-from tactile_resonance.nodes.tip_contact import TipContact, _failure
+from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact
 from tactile_resonance.scan.hands import PointDisturbed, ScanEnded
 from tactile_resonance.scan.point_outcome import StateTimes
 from tactile_resonance.scan.scene import Hold
@@ -35,7 +35,9 @@ def test_a_point_comes_again_where_the_cause_says_nothing_of_it(cause):
     known = {member.value for member in Cause}
     if cause not in known:
         pytest.fail(f"{cause}: expected one of {sorted(known)}")
-    failure = _failure(msg.ContactState(cause=cause, message="told"))
+    tip = TipContact.__new__(TipContact)
+    tip.stopped = False
+    failure = tip.failure(msg.ContactState(cause=cause, message="told"))
     assert isinstance(failure, PointDisturbed) == (cause in NOT_OF_THE_POINT)
     assert cause in str(failure)
     assert "told" in str(failure)
@@ -44,7 +46,7 @@ def test_a_point_comes_again_where_the_cause_says_nothing_of_it(cause):
 def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     """It took 0.3 s until the force was reached, at 5 s; that it is still held is said again and again."""
     tip = TipContact.__new__(TipContact)
-    tip._state, tip._held_ns, tip.stopped, tip._instance = None, 0, False, 0
+    tip._state, tip._held_ns, tip.stopped, tip._instance = UNKNOWN, 0, False, 0
     tip._times, tip._low = StateTimes(), False
 
     def make(goal, check, poll):

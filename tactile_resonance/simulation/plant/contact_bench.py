@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from tactile_resonance.clock import Demand, OfRosTime
+from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.interfaces import (
     ArmError,
     ArmFault,
@@ -48,7 +48,7 @@ CELL_DELAY_NS = 1_000_000
 """From a measurement of the cell to its arrival."""
 
 
-class VirtualBench(OfRosTime):
+class VirtualBench(Clock):
     """Robot, plant and time. It is the clock of the control loop.
 
     Parameters
