@@ -193,7 +193,7 @@ def nonlinear_distortion(
     ----------
     spectra : PeriodicSpectra
         At all harmonics of interest, excited or not, (..., M, 2, H): from
-        `spectra.averaged_spectra` in steady state or `local_polynomial.LocalPolynomialPlan` (which
+        `spectra.averaged_spectra` in steady state or `local_polynomial.transient_free_spectra` (which
         leaves harmonics alone when it estimates noise).
     excited_harmonics : (F,) int
         Odd harmonics, part of `spectra.harmonics`.

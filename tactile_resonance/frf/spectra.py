@@ -251,25 +251,6 @@ def error_variance(g: ComplexArray, covariance: ComplexArray) -> FloatArray:
     )
 
 
-def ratio_variance(mean: ComplexArray, covariance: ComplexArray) -> FloatArray:
-    """Variance of Y/U, to first order in the noise.
-
-    Parameters
-    ----------
-    mean : (..., 2, F) complex
-        [Y; U].
-    covariance : (..., 2, 2, F) complex
-
-    Returns
-    -------
-    (..., F) float
-        ``|Y/U|^2 (C_YY/|Y|^2 + C_UU/|U|^2 - 2 Re(C_YU / (Y conj U)))``, written without dividing by
-        Y (Pintelon & Schoukens 2012, chapter 2); NaN where there is no input.
-    """
-    input_power = power(mean[..., 1, :])
-    return error_variance(ratio(mean), covariance) / np.where(input_power == 0, np.nan, input_power)
-
-
 def conditional_variance(covariance: ComplexArray) -> FloatArray:
     """(..., F) variance of Y given U, for noise of covariance (..., 2, 2, F), [Y; U]."""
     u = covariance[..., 1, 1, :].real

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from scipy import io, signal
 
-from tactile_resonance.frf.estimate import fast_frf
+from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.faults import FaultKind, FaultReport, find_faults
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
 from tactile_resonance.frf.result import FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.multisine import design_multisine
@@ -237,9 +236,7 @@ def test_several_records_give_the_worst(record):
 
 def test_status_of_the_response(record):
     u, y = record
-    frf = fast_frf(
-        LocalPolynomialPlan(LINES, SAMPLES, PERIODS)(Spectrum.of(u, y)), sample_rate_hz=RATE
-    )
+    frf = frf_of_record(Spectrum.of(u[None], y[None]), LINES, sample_rate_hz=RATE)
     assert FaultReport().marked(frf) is frf
     worth_knowing = check(u, y + 1).marked(frf)
     assert worth_knowing.status is FrfStatus.OK
