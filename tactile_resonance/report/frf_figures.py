@@ -13,11 +13,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.analysis import Analysis
 from tactile_resonance.calibration.fit import Fitted
 from tactile_resonance.calibration.records import Load
 from tactile_resonance.frf.distortion import DetectionLines, Distortion
-from tactile_resonance.frf.variance_analysis import VarianceAnalysis
+from tactile_resonance.frf.variance_analysis import NestedMeans
 from tactile_resonance.report.drawing import decibel, draw_ellipse, new_figure
 
 
@@ -192,23 +193,24 @@ def _label(name: str, lines: DetectionLines) -> str:
 
 
 def draw_variance(
-    analysis: VarianceAnalysis, in_band: VarianceAnalysis, band_hz: tuple[float, float], title: str
+    found: NestedMeans, frequency_hz: FloatArray, band_hz: tuple[float, float], title: str
 ) -> Figure:
     """Mean FRF and the standard deviation over each source, in dB; the legend speaks of the band."""
     figure = new_figure(10, 6)
     axes = figure.subplots()
-    power = np.mean(np.abs(analysis.mean) ** 2, axis=0)
-    axes.semilogx(analysis.frequency_hz, decibel(power), "k-", lw=1, label="mean |G|")
-    for k, source in enumerate(reversed(analysis.sources)):
+    inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    power = np.mean(np.abs(found.mean) ** 2, axis=0)
+    axes.semilogx(frequency_hz, decibel(power), "k-", lw=1, label="mean |G|")
+    for k, source in enumerate(reversed(found.levels)):
         if source.variance is None:
             continue
         axes.plot(
-            analysis.frequency_hz,
+            frequency_hz,
             decibel(source.variance),
             ".",
             ms=2,
             color=f"C{k}",
-            label=f"over {source.name}: {in_band.source(source.name).rms_level_db:.1f} dB of rms |G| in "
+            label=f"over {source.name}: {found.rms_level_db(source, inside):.1f} dB of rms |G| in "
             f"the band, {source.dof} degrees of freedom",
         )
     axes.axvspan(*band_hz, color="0.92", zorder=0, label=f"band {band_hz[0]:g}-{band_hz[1]:g} Hz")
