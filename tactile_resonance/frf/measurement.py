@@ -62,9 +62,10 @@ class MeasurementFrf:
         if bins_band_hz is not None:
             self._bins_bands_hz = (bins_band_hz,)
         self._bands: tuple[PoleBand, ...] = ()
-        self._lines: IntArray | None = None
+        self._played: Excitation | None = None  # the first: all realisations excite the same lines
+        self._lines: IntArray = np.empty(0, np.int64)
         self._samples: FloatArray = np.empty((2, 0, 0))  # (2, room, N), rows [y; u]
-        self._spectra: dict[int, tuple[PeriodicSpectra, list[BandBins | None]]] = {}
+        self._spectra: dict[int, tuple[PeriodicSpectra, list[BandBins]]] = {}
         self._detection: dict[int, list[PeriodicSpectra]] = {}  # of each band that has such lines
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
@@ -102,12 +103,13 @@ class MeasurementFrf:
             self._remember(record)
             self._note("nothing was played")
             return self.frf()
-        if self._lines is None:
+        if self._played is None:
             self._bands = excitation.bands
             if self._bands:
                 self._bins_bands_hz = tuple(band.ends_hz for band in self._bands)
             self._lines = self._lines_of(excitation)
             self._samples = np.empty((2, excitation.periods, n))
+            self._played = excitation
         self._remember(record)
         block = Spectrum.of(u.reshape(-1, n), y.reshape(-1, n))
         self._check(block, excitation)
@@ -118,7 +120,7 @@ class MeasurementFrf:
                 "not used from there on"
             )
         else:
-            self._take(block, record.realisation, self._lines, excitation)
+            self._take(block, record.realisation, self._played)
         return self.frf()
 
     def frf(self) -> FRF:
@@ -183,9 +185,7 @@ class MeasurementFrf:
             )
         return lines
 
-    def _take(
-        self, record: Spectrum, realisation: int, lines: IntArray, excitation: Excitation
-    ) -> None:
+    def _take(self, record: Spectrum, realisation: int, excitation: Excitation) -> None:
         """Periods (P, N) that follow those of the same realisation without a gap."""
         if not np.all(np.isfinite(record.samples)):
             raise ValueError("record: samples are not finite, expected a complete block")
@@ -199,17 +199,14 @@ class MeasurementFrf:
         self._samples[:, so_far:periods] = record.samples
         if so_far:
             record = Spectrum(self._samples[:, :periods])
-        spectra = mean_spectra(record, lines, order=self._order, dof=self._dof)
-        bins = [
-            band_bins(
-                record,
-                excitation.harmonics,
-                sample_rate_hz=excitation.sample_rate_hz,
-                band_hz=band_hz,
-            )
+        spectra = mean_spectra(record, self._lines, order=self._order, dof=self._dof)
+        rate_hz, harmonics = excitation.sample_rate_hz, excitation.harmonics
+        found = [
+            band_bins(record, harmonics, sample_rate_hz=rate_hz, band_hz=band_hz)
             for band_hz in self._bins_bands_hz
         ]
-        self._spectra[realisation] = spectra, bins
+        bins = [of for of in found if of is not None]
+        self._spectra[realisation] = spectra, bins if len(bins) == len(found) else []
         if self._bands and excitation.grid in DETECTING:
             # the first period is left out: what a polynomial leaves of the transient hides distortion
             self._detection[realisation] = [
@@ -222,15 +219,14 @@ class MeasurementFrf:
         for number in self._spectra.keys() - self._whole:
             self._note(f"realisation {number + 1}: left out, shorter than the others")
         each, bins_of_each = zip(*(self._spectra[number] for number in self._whole), strict=True)
-        frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
-        stacked = [stacked_bins(of) for of in zip(*bins_of_each, strict=True)]
-        known = [of for of in stacked if of is not None and of.u.size <= MOST_BINS]
-        if not known or len(known) < len(stacked):
-            known = []
+        frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=rate_hz)
+        stacked = tuple(stacked_bins(of) for of in zip(*bins_of_each, strict=True))
+        if any(of.u.size > MOST_BINS for of in stacked):
+            stacked = ()
         self._frf = replace(
             frf,
-            bins=known[0] if known else None,
-            further_bins=tuple(known[1:]),
+            bins=stacked[0] if stacked else None,
+            further_bins=stacked[1:],
             distortion=self._distortion(excitation),
         )
 

@@ -203,30 +203,12 @@ def averaged_spectra(
 
 
 def stacked_spectra(realisations: Sequence[PeriodicSpectra]) -> PeriodicSpectra:
-    """Spectra (..., M, 2, F) of M realisations from those of each, (..., 2, F).
-
-    The number of periods may differ; `periods` and `noise_dof` are then those of the shortest, and
-    without a covariance of each there is none.
-
-    Raises
-    ------
-    ValueError
-        If lines or period lengths differ.
-    """
-    first = realisations[0]
-    for other in realisations[1:]:
-        if other.samples_per_period != first.samples_per_period or not np.array_equal(
-            other.harmonics, first.harmonics
-        ):
-            raise ValueError("realisations: lines or period lengths differ, expected the same")
+    """Spectra (..., M, 2, F) of M realisations from those of each, (..., 2, F), of as many periods and lines."""
     covariances = [each.covariance for each in realisations if each.covariance is not None]
-    complete = len(covariances) == len(realisations)
     return replace(
-        first,
-        periods=min(each.periods for each in realisations),
+        realisations[0],
         spectra=np.stack([each.spectra for each in realisations], axis=-3),
-        covariance=np.stack(covariances, axis=-4) if complete else None,
-        noise_dof=min(each.noise_dof for each in realisations) if complete else 0,
+        covariance=np.stack(covariances, axis=-4) if covariances else None,
     )
 
 
