@@ -298,7 +298,10 @@ def _detection_lines(
     y_excited, u_excited = excited.spectra[..., 0, :], excited.spectra[..., 1, :]  # (..., M, F)
 
     def at_lines(values: npt.NDArray) -> npt.NDArray:
-        return _interpolate(excited.harmonics, values, lines.harmonics)
+        """(..., L) linear interpolation of (..., F); NaN outside the excited band."""
+        return np.apply_along_axis(
+            lambda row: np.interp(lines.harmonics, excited.harmonics, row, np.nan, np.nan), -1, values
+        )
 
     g = at_lines(y_excited / u_excited)  # (..., M, L)
     corrected_variance = None
@@ -315,17 +318,6 @@ def _detection_lines(
         excited_input_power=at_lines(np.mean(np.abs(u_excited) ** 2, axis=-2)),
         noise_dof=lines.noise_dof,
     )
-
-
-def _interpolate(x: IntArray, values: npt.NDArray, at: IntArray) -> npt.NDArray:
-    """(..., L) linear interpolation of (..., F); NaN outside of x."""
-    right = np.clip(np.searchsorted(x, at), 1, max(x.size - 1, 1))
-    if x.size == 1:  # nothing lies between excited lines
-        return np.full((*values.shape[:-1], at.size), np.nan, values.dtype)
-    weight = (at - x[right - 1]) / (x[right] - x[right - 1])
-    result = values[..., right - 1] * (1 - weight) + values[..., right] * weight
-    result[..., (at < x[0]) | (at > x[-1])] = np.nan
-    return result
 
 
 def _sentence(name: str, lines: DetectionLines) -> str:

@@ -66,9 +66,7 @@ class Fault:
     spoils : bool
         The FRF cannot be trusted because of it; otherwise it is worth knowing only.
     text : str
-        For people to read; no full stop.
-    seen_in : str
-        In how many of several records; empty where there was one.
+        For people to read; no full stop. Of several records also in how many.
     """
 
     kind: FaultKind
@@ -76,12 +74,11 @@ class Fault:
     value: float
     spoils: bool
     text: str
-    seen_in: str = ""
 
     @property
     def message(self) -> str:
         """A sentence for people."""
-        return f"{self.text}{self.seen_in and ' ' + self.seen_in}."
+        return f"{self.text}."
 
 
 @dataclass(frozen=True)
@@ -95,11 +92,6 @@ class FaultReport:
     """
 
     faults: tuple[Fault, ...] = ()
-
-    @property
-    def kinds(self) -> frozenset[FaultKind]:
-        """Kinds of fault present."""
-        return frozenset(fault.kind for fault in self.faults)
 
     @property
     def suspect(self) -> bool:
@@ -189,7 +181,8 @@ def worst_of(per_record: Iterable[list[Fault]]) -> FaultReport:
     for same in found.values():
         worst = max(same, key=lambda fault: (fault.spoils, fault.value))
         if len(records) > 1:
-            worst = replace(worst, seen_in=f"(in {len(same)} of {len(records)} records)")
+            text = f"{worst.text} (in {len(same)} of {len(records)} records)"
+            worst = replace(worst, text=text)
         merged.append(worst)
     return FaultReport(tuple(merged))
 
