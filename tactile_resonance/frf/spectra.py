@@ -203,7 +203,7 @@ def averaged_spectra(
 
 
 def stacked_spectra(realisations: Sequence[PeriodicSpectra]) -> PeriodicSpectra:
-    """Spectra (..., M, 2, F) of M realisations from those of each, (..., 2, F), of as many periods and lines."""
+    """Spectra (..., M, 2, F) of M realisations of as many periods, from those of each, (..., 2, F)."""
     covariances = [each.covariance for each in realisations if each.covariance is not None]
     return replace(
         realisations[0],

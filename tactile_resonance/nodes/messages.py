@@ -45,6 +45,7 @@ from tactile_resonance.recording.messages import (
     write_poles,
     write_pose,
     write_record,
+    write_values,
 )
 from tactile_resonance.srv import ForceOver
 
@@ -113,15 +114,10 @@ def pose_to_message(contact: Contact) -> PoseStamped:
 
 def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) -> msg.FRF:
     """Message of an FRF with (F,) arrays."""
-    equal = {name: getattr(frf, name) for name in FRF_EQUAL}
-    message = msg.FRF(level_v=level_v, saturated=saturated, status=FRF_STATUS[frf.status], **equal)
+    message = msg.FRF(level_v=level_v, saturated=saturated, status=FRF_STATUS[frf.status])
     write_origin(message, origin)
-    fill(message.frequency_hz, frf.frequency_hz)
+    write_values(message, (*FRF_EQUAL, "frequency_hz", *FRF_OPTIONAL), frf)
     fill_complex(message, "", frf.g)
-    for name in FRF_OPTIONAL:
-        values = getattr(frf, name)
-        if values is not None:
-            fill(getattr(message, name), values)
     write_bands(message, msg.Band, frf.bands)
     write_distortion(message, msg.Distortion, frf.distortion)
     if frf.bins is not None:
@@ -236,12 +232,8 @@ def touch_of(
 
 def contact_result(result: ContactResult) -> MakeContact.Result:
     """What became of a contact; NaN for what is not known."""
-    message = MakeContact.Result(
-        reached=result.reached, cause=result.cause.value, message=result.message
-    )
-    for name in CONTACT_FIGURES:
-        value = getattr(result, name)
-        setattr(message, name, math.nan if value is None else float(value))
+    message = MakeContact.Result(cause=result.cause.value)
+    write_values(message, ("reached", "message", *CONTACT_FIGURES), result)
     return message
 
 
@@ -262,8 +254,7 @@ def write_force_over(
 ) -> ForceOver.Response:
     """Write the force over an interval, or why it is not known."""
     response.reason, response.force_n, response.force_std_n = reason, force_n, force_std_n
-    for name in SPREAD:
-        setattr(response, f"force_{name}", getattr(spread, name))
+    write_values(response, SPREAD, spread, "force_")
     return response
 
 

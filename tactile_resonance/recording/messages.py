@@ -71,7 +71,7 @@ def excitation_from_message(message: Any) -> Excitation:
     ValueError
         If its fields contradict each other.
     """
-    arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in EXCITATION_ARRAYS}
+    arrays = _values(message, EXCITATION_ARRAYS)
     arrays["harmonics"] = arrays["harmonics"].astype(np.int64)
     grid = key_of(GRIDS, message.grid, "grid")
     bands = bands_from_message(message)
@@ -93,10 +93,8 @@ def write_excitation(
 ) -> None:
     """Fill the message of an excitation designed at `time_ns`; `make` gives messages for its bands."""
     write_header(message.header, time_ns, frame_id)
-    _write_values(message, EXCITATION, excitation)
-    for name in EXCITATION_ARRAYS:
-        fill(getattr(message, name), getattr(excitation, name))
-    message.grid, message.level_v = GRIDS[excitation.grid], excitation.level_v
+    write_values(message, (*EXCITATION, *EXCITATION_ARRAYS, "level_v"), excitation)
+    message.grid = GRIDS[excitation.grid]
     write_bands(message, make, excitation.bands)
 
 
@@ -118,20 +116,18 @@ def record_from_message(message: Any) -> Record:
 
 def write_record(message: Any, record: Record) -> None:
     """Fill the message of a record."""
-    _write_values(message, RECORD, record)
+    write_values(message, RECORD, record)
     message.input_kind = INPUT_KINDS[record.input_kind]
     message.between_samples = BETWEEN_SAMPLES[record.between_samples]
     for name, channel in (("actuator", record.actuator), ("sensor", record.sensor)):
         setattr(message, f"{name}_saturated", channel.saturated)
         if channel.is_counts:
             fill(getattr(message, f"{name}_counts"), channel.samples)
-            setattr(message, f"{name}_scale_v", channel.scale_v)
-            setattr(message, f"{name}_offset_v", channel.offset_v)
+            write_values(message, ("scale_v", "offset_v"), channel, f"{name}_")
         else:
             fill(getattr(message, f"{name}_v"), channel.samples)
     write_origin(message, record.origin)
-    message.contact_coverage = float(record.origin.contact.coverage)
-    message.contact_reason = record.origin.contact.reason
+    write_values(message, ("coverage", "reason"), record.origin.contact, "contact_")
 
 
 def _channel(message: Any, name: str) -> Channel:
@@ -158,20 +154,18 @@ def poles_from_message(message: Any) -> tuple[Poles, Origin]:
 def _poles_of_band(message: Any) -> Poles:
     """Of a message of ``Poles`` those of its first band, or of ``BandPoles``."""
     poles_rad_s = complex_of(message, "", "_rad_s")
-    arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in POLES_ARRAYS}
-    for name in (*POLES_DRIFTS, *POLES_COVARIANCES):
-        arrays[name] = optional(getattr(message, name))
+    optionals: dict[str, Any] = {name: optional(getattr(message, name)) for name in POLES_DRIFTS}
     for name in POLES_COVARIANCES:
-        if (covariance := arrays[name]) is not None:
-            arrays[name] = covariance.reshape(poles_rad_s.size, 2, 2)
+        covariance, shape = optional(getattr(message, name)), (poles_rad_s.size, 2, 2)
+        optionals[name] = None if covariance is None else covariance.reshape(shape)
     structure = ModelStructure()
     if message.order:
         structure = ModelStructure(message.order, message.numerator_order)
     return Poles(
         poles_rad_s=poles_rad_s,
         residues=complex_of(message, "residue_"),
-        **arrays,
-        **_values(message, POLES),
+        **optionals,
+        **_values(message, (*POLES, *POLES_ARRAYS)),
         instant_s=None if math.isnan(message.instant_s) else message.instant_s,
         structure=structure,
         band_hz=(message.band_low_hz, message.band_high_hz),
@@ -190,16 +184,13 @@ def write_poles(message: Any, make: Callable[[], Any], poles: Poles, origin: Ori
 
 
 def _write_band(message: Any, poles: Poles) -> None:
-    _write_values(message, POLES, poles)
+    arrays = (*POLES_ARRAYS, *POLES_DRIFTS, *POLES_COVARIANCES)
+    write_values(message, (*POLES, *arrays, "instant_s"), poles)
     message.order, message.numerator_order = poles.structure.order, poles.structure.numerator_order
     message.band_low_hz, message.band_high_hz = map(float, poles.band_hz)
-    message.instant_s = math.nan if poles.instant_s is None else poles.instant_s
     message.status = POLES_STATUS[poles.status]
     fill_complex(message, "", poles.poles_rad_s, "_rad_s")
     fill_complex(message, "residue_", poles.residues)
-    for name in (*POLES_ARRAYS, *POLES_DRIFTS, *POLES_COVARIANCES):
-        if (known := getattr(poles, name)) is not None:
-            fill(getattr(message, name), known)
 
 
 def distortion_from_message(message: Any) -> tuple[BandDistortion, ...]:
@@ -237,12 +228,10 @@ def write_origin(message: Any, origin: Origin) -> None:
     """Write what a record, FRF or poles belong to."""
     contact = origin.contact
     write_header(message.header, origin.time_ns, origin.frame_id)
-    _write_values(message, ORIGIN, origin)
+    write_values(message, ORIGIN, origin)
     write_pose(message.tip_pose, contact)
-    message.contact_force_n = float(contact.force_n)
-    message.contact_force_std_n = float(contact.force_std_n)
-    for name in SPREAD:
-        setattr(message, f"contact_force_{name}", float(getattr(contact.spread, name)))
+    write_values(message, ("force_n", "force_std_n"), contact, "contact_")
+    write_values(message, SPREAD, contact.spread, "contact_force_")
 
 
 def contact_from_message(message: Any, force_n: float, force_std_n: float) -> Contact:
@@ -277,6 +266,7 @@ def spread_from_message(message: Any, prefix: str) -> ForceSpread:
 
 PROTOCOLS = {Protocol.RELAXATION: 1, Protocol.CREEP: 2, Protocol.INDENTATION: 3}
 """Constants of ``msg/Indentation``."""
+INDENTATION = ("time_s", "force_n", "depth_m", "force_std_n", "simulated")
 
 
 def indentation_from_message(message: Any, label: str = "") -> IndentationRecord:
@@ -290,31 +280,21 @@ def indentation_from_message(message: Any, label: str = "") -> IndentationRecord
     stiffness = message.beam_stiffness_n_per_m
     return IndentationRecord(
         protocol=key_of(PROTOCOLS, message.protocol, "protocol"),
-        time_s=array_of(message.time_s),
-        force_n=array_of(message.force_n),
-        depth_m=array_of(message.depth_m),
+        **_values(message, INDENTATION),
         ball=BallTip(message.tip_radius_m, stiffness_n_per_m=stiffness or math.inf),
-        force_std_n=message.force_std_n,
         label=label,
         source=message.force_source,
-        simulated=message.simulated,
     )
 
 
 def write_indentation(message: Any, test: IndentationRecord) -> None:
     """Write a record into a message."""
     message.protocol = PROTOCOLS[test.protocol]
-    for name in ("time_s", "force_n", "depth_m"):
-        values = getattr(message, name)
-        if isinstance(values, array.array):
-            fill(values, getattr(test, name))
-        else:
-            setattr(message, name, getattr(test, name))
+    write_values(message, INDENTATION, test)
     stiffness = test.ball.stiffness_n_per_m
     message.beam_stiffness_n_per_m = stiffness if math.isfinite(stiffness) else 0.0
     message.tip_radius_m = test.ball.radius_m
-    message.force_std_n, message.force_source = test.force_std_n, test.source
-    message.simulated = test.simulated
+    message.force_source = test.source
 
 
 def time_from_message(stamp: Any) -> int:
@@ -367,14 +347,30 @@ def key_of(table: dict[E, int], value: int, name: str) -> E:
 
 
 def _values(message: Any, names: Iterable[str]) -> dict[str, Any]:
-    return {name: getattr(message, name) for name in names}
+    """Fields by name, arrays as numpy sees them."""
+    fields = {name: getattr(message, name) for name in names}
+    return {
+        name: array_of(value) if isinstance(value, array.array) else value
+        for name, value in fields.items()
+    }
 
 
-def _write_values(message: Any, names: Iterable[str], source: object) -> None:
-    """Write fields of equal name; numbers of numpy as those of Python, which alone rclpy takes."""
+def write_values(message: Any, names: Iterable[str], source: object, prefix: str = "") -> None:
+    """Write what an object has under these names to the fields so called behind a prefix.
+
+    Numbers of numpy become those of Python, which alone rclpy takes; where the object has None, an array stays
+    empty and a number is NaN.
+    """
     for name in names:
-        value = getattr(source, name)
-        setattr(message, name, value.item() if isinstance(value, np.generic) else value)
+        value, target = getattr(source, name), getattr(message, prefix + name)
+        if isinstance(target, array.array):
+            if value is not None:
+                fill(target, value)
+        elif isinstance(target, np.ndarray):
+            setattr(message, prefix + name, value)
+        else:
+            kind = type(target)
+            setattr(message, prefix + name, kind(math.nan if value is None else value))
 
 
 def _write_each(
@@ -383,4 +379,4 @@ def _write_each(
     """Append a message of fields of equal name for each object."""
     for source in sources:
         target.append(make())
-        _write_values(target[-1], names, source)
+        write_values(target[-1], names, source)
