@@ -23,7 +23,7 @@ from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF, PER_LINE, FrfStatus
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, Origin, Record
@@ -38,6 +38,7 @@ from tactile_resonance.recording.messages import (
     key_of,
     optional,
     origin_from_message,
+    plain,
     write_bands,
     write_distortion,
     write_excitation,
@@ -58,11 +59,8 @@ if TYPE_CHECKING:  # nodes without contact control do not load it
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
 
 # Fields of equal name in message and object.
-FRF_EQUAL = ("noise_dof", "total_dof", "periods", "realisations", "method", "message")
-FRF_OPTIONAL = (
-    *("variance_noise", "variance_total"),
-    *("actuator_amplitude", "sensor_variance_given_actuator"),
-)
+FRF_EQUAL = plain(FRF)
+FRF_OPTIONAL = tuple(name for name in PER_LINE if name not in ("frequency_hz", "g"))
 
 UNKNOWN_SPREAD = ForceSpread()
 CONTACT_FIGURES = (

@@ -47,7 +47,7 @@ POLES_STATUS = {
 }
 
 
-def _plain(kind: type) -> tuple[str, ...]:
+def plain(kind: type) -> tuple[str, ...]:
     """Fields of a dataclass that are numbers or texts: message and object name them alike."""
     return tuple(each.name for each in fields(kind) if each.type in ("int", "float", "bool", "str"))
 
@@ -58,8 +58,8 @@ POLES = ("lines", "cost", "expected_cost", "condition_number", "method", "messag
 POLES_ARRAYS = ("f0_hz", "damping_ratio")
 POLES_DRIFTS = ("f0_drift_hz_per_s", "damping_drift_per_s")
 POLES_COVARIANCES = ("covariance", "total_covariance", "drift_covariance")
-EXCITATION, RECORD, BAND = _plain(Excitation), _plain(Record), _plain(PoleBand)
-DISTORTION, SPREAD = _plain(BandDistortion), _plain(ForceSpread)
+EXCITATION, RECORD, BAND = plain(Excitation), plain(Record), plain(PoleBand)
+DISTORTION, SPREAD = plain(BandDistortion), plain(ForceSpread)
 E = TypeVar("E", bound=Enum)
 
 
