@@ -160,12 +160,9 @@ def find_faults(
                 np.asarray(harmonics),
                 transient_spoils=not transient_removed,
             )
-            missing = missing_samples(channel)
-            if missing is not None:
-                faults.append(missing)
-            if channel.complete:  # else nothing more can be detected
-                found = (check(channel) for check in CHECKS)
-                faults += [fault for fault in found if fault is not None]
+            # of a channel that lacks samples nothing more can be detected
+            checks = CHECKS if channel.complete else (missing_samples,)
+            faults += filter(None, (check(channel) for check in checks))
         reports.append(faults)
     return worst_of(reports)
 
@@ -442,8 +439,8 @@ def clocks(x: _Channel) -> Fault | None:
     return x.fault(FaultKind.CLOCKS, ppm, bool(turned > SPOILING_TURN), text)
 
 
-CHECKS = (saturation, offset, drift, hum, lost_samples, clocks, unsettled)
-"""What is looked for in each channel that lacks no sample."""
+CHECKS = (missing_samples, saturation, offset, drift, hum, lost_samples, clocks, unsettled)
+"""What is looked for in each channel."""
 
 
 def _clipped(record: FloatArray, periods: int) -> int:
