@@ -206,8 +206,8 @@ def nonlinear_distortion(
     Raises
     ------
     ValueError
-        If an even harmonic is excited (its mixing products do not keep to a parity), there is no
-        detection line, or shapes do not fit.
+        If an even harmonic is excited (its mixing products do not keep to a parity), or there is no
+        detection line.
 
     Notes
     -----
@@ -219,10 +219,6 @@ def nonlinear_distortion(
     Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
     chapter 4 (fast method, detection lines, correction for the input).
     """
-    if spectra.spectra.ndim < 3:
-        raise ValueError(
-            f"spectra: shape {spectra.spectra.shape}, expected (..., M, 2, H) with realisations M"
-        )
     excited = spectra.at(excited_harmonics)
     if np.any(excited.harmonics % 2 == 0):
         raise ValueError(

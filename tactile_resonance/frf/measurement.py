@@ -15,7 +15,7 @@ from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
 from tactile_resonance.frf.distortion import DETECTING, band_lines, distortion_in_band
 from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
 from tactile_resonance.frf.faults import Fault, FaultKind, FaultReport, find_faults
-from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus
+from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.skew import correct_skew
 from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, stacked_spectra
 from tactile_resonance.multisine import Excitation
@@ -65,8 +65,10 @@ class MeasurementFrf:
         self._played: Excitation | None = None  # the first: all realisations excite the same lines
         self._lines: IntArray = np.empty(0, np.int64)
         self._samples: FloatArray = np.empty((2, 0, 0))  # (2, room, N), rows [y; u]
-        self._spectra: dict[int, tuple[PeriodicSpectra, list[BandBins]]] = {}
-        self._detection: dict[int, list[PeriodicSpectra]] = {}  # of each band that has such lines
+        # of each realisation; bins and lines that show distortion in each band
+        self._spectra: dict[
+            int, tuple[PeriodicSpectra, list[BandBins], list[PeriodicSpectra]]
+        ] = {}
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
         self._notes: list[str] = []
@@ -206,47 +208,39 @@ class MeasurementFrf:
             for band_hz in self._bins_bands_hz
         ]
         bins = [of for of in found if of is not None]
-        self._spectra[realisation] = spectra, bins if len(bins) == len(found) else []
-        if self._bands and excitation.grid in DETECTING:
-            # the first period is left out: what a polynomial leaves of the transient hides distortion
-            self._detection[realisation] = [
-                mean_spectra(record, band_lines(excitation, band.ends_hz), method="average")
-                for band in self._bands
-            ]
+        if len(bins) < len(found):
+            bins = []
+        # the first period is left out: what a polynomial leaves of the transient hides distortion
+        detection = [
+            mean_spectra(record, band_lines(excitation, band.ends_hz), method="average")
+            for band in (self._bands if excitation.grid in DETECTING else ())
+        ]
+        self._spectra[realisation] = spectra, bins, detection
         self._periods[realisation] = periods
         if periods < max(self._periods.values()):
             return  # it counts once it is as long as the others
-        for number in self._spectra.keys() - self._whole:
+        # with one that lost blocks all others would count as equally short
+        whole = [number for number in self._spectra if self._periods[number] == periods]
+        for number in self._spectra.keys() - whole:
             self._note(f"realisation {number + 1}: left out, shorter than the others")
-        each, bins_of_each = zip(*(self._spectra[number] for number in self._whole), strict=True)
+        each, bins_of_each, detection_of_each = zip(
+            *(self._spectra[number] for number in whole), strict=True
+        )
         frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=rate_hz)
         stacked = tuple(stacked_bins(of) for of in zip(*bins_of_each, strict=True))
         if any(of.u.size > MOST_BINS for of in stacked):
             stacked = ()
+        in_bands = zip(self._bands, zip(*detection_of_each, strict=True), strict=False)
         self._frf = replace(
             frf,
             bins=stacked[0] if stacked else None,
             further_bins=stacked[1:],
-            distortion=self._distortion(excitation),
-        )
-
-    @property
-    def _whole(self) -> list[int]:
-        """Realisations that count: with one that lost blocks all others would count as equally short."""
-        longest = max(self._periods.values())
-        return [number for number in self._spectra if self._periods[number] == longest]
-
-    def _distortion(self, excitation: Excitation) -> tuple[BandDistortion, ...]:
-        """In each band, from all realisations that count."""
-        realisations = [self._detection[number] for number in self._whole if number in self._detection]
-        return tuple(
-            distortion_in_band(
-                stacked_spectra([of[k] for of in realisations]),
-                excitation.harmonics,
-                band.ends_hz,
-                sample_rate_hz=excitation.sample_rate_hz,
-            )
-            for k, band in enumerate(self._bands if realisations else ())
+            distortion=tuple(
+                distortion_in_band(
+                    stacked_spectra(of), harmonics, band.ends_hz, sample_rate_hz=rate_hz
+                )
+                for band, of in in_bands
+            ),
         )
 
     def _check(self, block: Spectrum, excitation: Excitation) -> None:

@@ -53,12 +53,14 @@ def plain(kind: type) -> tuple[str, ...]:
 
 
 ORIGIN = ("measurement_id", "excitation_id", "final", "label", "simulated")
-EXCITATION_ARRAYS = ("harmonics", "amplitude_v", "phase_rad")
-POLES = ("lines", "cost", "expected_cost", "condition_number", "method", "message")
-POLES_ARRAYS = ("f0_hz", "damping_ratio")
+EXCITATION = (*plain(Excitation), "harmonics", "amplitude_v", "phase_rad")
+POLES = (
+    *("lines", "cost", "expected_cost", "condition_number", "method", "message"),
+    *("f0_hz", "damping_ratio"),
+)
 POLES_DRIFTS = ("f0_drift_hz_per_s", "damping_drift_per_s")
 POLES_COVARIANCES = ("covariance", "total_covariance", "drift_covariance")
-EXCITATION, RECORD, BAND = plain(Excitation), plain(Record), plain(PoleBand)
+RECORD, BAND = plain(Record), plain(PoleBand)
 DISTORTION, SPREAD = plain(BandDistortion), plain(ForceSpread)
 E = TypeVar("E", bound=Enum)
 
@@ -71,11 +73,10 @@ def excitation_from_message(message: Any) -> Excitation:
     ValueError
         If its fields contradict each other.
     """
-    arrays = _values(message, EXCITATION_ARRAYS)
-    arrays["harmonics"] = arrays["harmonics"].astype(np.int64)
+    fields = _values(message, EXCITATION)
+    fields["harmonics"] = fields["harmonics"].astype(np.int64)
     grid = key_of(GRIDS, message.grid, "grid")
-    bands = bands_from_message(message)
-    return Excitation(**_values(message, EXCITATION), **arrays, grid=grid, bands=bands)
+    return Excitation(**fields, grid=grid, bands=bands_from_message(message))
 
 
 def bands_from_message(message: Any) -> tuple[PoleBand, ...]:
@@ -93,7 +94,7 @@ def write_excitation(
 ) -> None:
     """Fill the message of an excitation designed at `time_ns`; `make` gives messages for its bands."""
     write_header(message.header, time_ns, frame_id)
-    write_values(message, (*EXCITATION, *EXCITATION_ARRAYS, "level_v"), excitation)
+    write_values(message, (*EXCITATION, "level_v"), excitation)
     message.grid = GRIDS[excitation.grid]
     write_bands(message, make, excitation.bands)
 
@@ -165,7 +166,7 @@ def _poles_of_band(message: Any) -> Poles:
         poles_rad_s=poles_rad_s,
         residues=complex_of(message, "residue_"),
         **optionals,
-        **_values(message, (*POLES, *POLES_ARRAYS)),
+        **_values(message, POLES),
         instant_s=None if math.isnan(message.instant_s) else message.instant_s,
         structure=structure,
         band_hz=(message.band_low_hz, message.band_high_hz),
@@ -184,8 +185,8 @@ def write_poles(message: Any, make: Callable[[], Any], poles: Poles, origin: Ori
 
 
 def _write_band(message: Any, poles: Poles) -> None:
-    arrays = (*POLES_ARRAYS, *POLES_DRIFTS, *POLES_COVARIANCES)
-    write_values(message, (*POLES, *arrays, "instant_s"), poles)
+    optionals = (*POLES_DRIFTS, *POLES_COVARIANCES)
+    write_values(message, (*POLES, *optionals, "instant_s"), poles)
     message.order, message.numerator_order = poles.structure.order, poles.structure.numerator_order
     message.band_low_hz, message.band_high_hz = map(float, poles.band_hz)
     message.status = POLES_STATUS[poles.status]
