@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excitations, records and poles from and to messages, without ROS: each field is listed once, here.
+"""Excitations, records and poles from messages, without ROS: each field of equal name is listed once, here.
 
 A message is whatever has the fields of ``msg/Excitation.msg`` and so on: arrays may be those of rclpy
 (`array.array`) or of numpy. Those of rclpy are read as views of the message's memory (``numpy.frombuffer``)
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import array
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from enum import Enum
 from typing import Any, TypeVar
@@ -63,6 +63,7 @@ POLES_COVARIANCES = ("covariance", "total_covariance", "drift_covariance")
 RECORD, BAND = plain(Record), plain(PoleBand)
 DISTORTION, SPREAD = plain(BandDistortion), plain(ForceSpread)
 E = TypeVar("E", bound=Enum)
+M = TypeVar("M")
 
 
 def excitation_from_message(message: Any) -> Excitation:
@@ -73,30 +74,15 @@ def excitation_from_message(message: Any) -> Excitation:
     ValueError
         If its fields contradict each other.
     """
-    fields = _values(message, EXCITATION)
-    fields["harmonics"] = fields["harmonics"].astype(np.int64)
+    values = _values(message, EXCITATION)
+    values["harmonics"] = values["harmonics"].astype(np.int64)
     grid = key_of(GRIDS, message.grid, "grid")
-    return Excitation(**fields, grid=grid, bands=bands_from_message(message))
+    return Excitation(**values, grid=grid, bands=bands_from_message(message))
 
 
 def bands_from_message(message: Any) -> tuple[PoleBand, ...]:
     """Bands in which poles are wanted, of a message with the field ``bands``."""
     return tuple(PoleBand(**_values(band, BAND)) for band in message.bands)
-
-
-def write_bands(message: Any, make: Callable[[], Any], bands: Sequence[PoleBand]) -> None:
-    """Fill the field ``bands`` with messages that `make` gives."""
-    _write_each(message.bands, make, BAND, bands)
-
-
-def write_excitation(
-    message: Any, make: Callable[[], Any], excitation: Excitation, time_ns: int, frame_id: str
-) -> None:
-    """Fill the message of an excitation designed at `time_ns`; `make` gives messages for its bands."""
-    write_header(message.header, time_ns, frame_id)
-    write_values(message, (*EXCITATION, "level_v"), excitation)
-    message.grid = GRIDS[excitation.grid]
-    write_bands(message, make, excitation.bands)
 
 
 def record_from_message(message: Any) -> Record:
@@ -113,22 +99,6 @@ def record_from_message(message: Any) -> Record:
         between_samples=key_of(BETWEEN_SAMPLES, message.between_samples, "between_samples"),
         origin=origin_from_message(message),
     )
-
-
-def write_record(message: Any, record: Record) -> None:
-    """Fill the message of a record."""
-    write_values(message, RECORD, record)
-    message.input_kind = INPUT_KINDS[record.input_kind]
-    message.between_samples = BETWEEN_SAMPLES[record.between_samples]
-    for name, channel in (("actuator", record.actuator), ("sensor", record.sensor)):
-        setattr(message, f"{name}_saturated", channel.saturated)
-        if channel.is_counts:
-            fill(getattr(message, f"{name}_counts"), channel.samples)
-            write_values(message, ("scale_v", "offset_v"), channel, f"{name}_")
-        else:
-            fill(getattr(message, f"{name}_v"), channel.samples)
-    write_origin(message, record.origin)
-    write_values(message, ("coverage", "reason"), record.origin.contact, "contact_")
 
 
 def _channel(message: Any, name: str) -> Channel:
@@ -174,36 +144,9 @@ def _poles_of_band(message: Any) -> Poles:
     )
 
 
-def write_poles(message: Any, make: Callable[[], Any], poles: Poles, origin: Origin) -> None:
-    """Fill the message of poles; `make` gives messages for those of further bands."""
-    write_origin(message, origin)
-    _write_band(message, poles)
-    for each in poles.further:
-        band = make()
-        _write_band(band, each)
-        message.further.append(band)
-
-
-def _write_band(message: Any, poles: Poles) -> None:
-    optionals = (*POLES_DRIFTS, *POLES_COVARIANCES)
-    write_values(message, (*POLES, *optionals, "instant_s"), poles)
-    message.order, message.numerator_order = poles.structure.order, poles.structure.numerator_order
-    message.band_low_hz, message.band_high_hz = map(float, poles.band_hz)
-    message.status = POLES_STATUS[poles.status]
-    fill_complex(message, "", poles.poles_rad_s, "_rad_s")
-    fill_complex(message, "residue_", poles.residues)
-
-
 def distortion_from_message(message: Any) -> tuple[BandDistortion, ...]:
     """Distortion in each band, of a message with the field ``distortion``."""
     return tuple(BandDistortion(**_values(band, DISTORTION)) for band in message.distortion)
-
-
-def write_distortion(
-    message: Any, make: Callable[[], Any], distortion: Sequence[BandDistortion]
-) -> None:
-    """Fill the field ``distortion`` with messages that `make` gives."""
-    _write_each(message.distortion, make, DISTORTION, distortion)
 
 
 def origin_from_message(message: Any) -> Origin:
@@ -225,16 +168,6 @@ def origin_from_message(message: Any) -> Origin:
     )
 
 
-def write_origin(message: Any, origin: Origin) -> None:
-    """Write what a record, FRF or poles belong to."""
-    contact = origin.contact
-    write_header(message.header, origin.time_ns, origin.frame_id)
-    write_values(message, ORIGIN, origin)
-    write_pose(message.tip_pose, contact)
-    write_values(message, ("force_n", "force_std_n"), contact, "contact_")
-    write_values(message, SPREAD, contact.spread, "contact_force_")
-
-
 def contact_from_message(message: Any, force_n: float, force_std_n: float) -> Contact:
     """Contact of a tip pose and a force."""
     if not message.header.frame_id:
@@ -248,16 +181,6 @@ def contact_from_message(message: Any, force_n: float, force_std_n: float) -> Co
         message.header.frame_id,
         time_from_message(message.header.stamp),
     )
-
-
-def write_pose(message: Any, contact: Contact) -> None:
-    """Write the pose of a tip; an empty frame where its position is unknown."""
-    if contact.position_m is None:
-        return
-    write_header(message.header, contact.time_ns, contact.frame_id)
-    point, turn = message.pose.position, message.pose.orientation
-    point.x, point.y, point.z = contact.position_m
-    turn.x, turn.y, turn.z, turn.w = contact.orientation_xyzw
 
 
 def spread_from_message(message: Any, prefix: str) -> ForceSpread:
@@ -349,15 +272,15 @@ def key_of(table: dict[E, int], value: int, name: str) -> E:
 
 def _values(message: Any, names: Iterable[str]) -> dict[str, Any]:
     """Fields by name, arrays as numpy sees them."""
-    fields = {name: getattr(message, name) for name in names}
+    values = {name: getattr(message, name) for name in names}
     return {
         name: array_of(value) if isinstance(value, array.array) else value
-        for name, value in fields.items()
+        for name, value in values.items()
     }
 
 
-def write_values(message: Any, names: Iterable[str], source: object, prefix: str = "") -> None:
-    """Write what an object has under these names to the fields so called behind a prefix.
+def write_values(message: M, names: Iterable[str], source: object, prefix: str = "") -> M:
+    """Write what an object has under these names to the fields so called behind a prefix; return the message.
 
     Numbers of numpy become those of Python, which alone rclpy takes; where the object has None, an array stays
     empty and a number is NaN.
@@ -372,12 +295,4 @@ def write_values(message: Any, names: Iterable[str], source: object, prefix: str
         else:
             kind = type(target)
             setattr(message, prefix + name, kind(math.nan if value is None else value))
-
-
-def _write_each(
-    target: list[Any], make: Callable[[], Any], names: Iterable[str], sources: Sequence[object]
-) -> None:
-    """Append a message of fields of equal name for each object."""
-    for source in sources:
-        target.append(make())
-        write_values(target[-1], names, source)
+    return message
