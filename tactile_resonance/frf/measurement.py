@@ -14,7 +14,7 @@ from tactile_resonance.contact.force_spread import joined_spread
 from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
 from tactile_resonance.frf.distortion import DETECTING, band_lines, distortion_in_band
 from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
-from tactile_resonance.frf.faults import Fault, FaultKind, FaultReport, find_faults
+from tactile_resonance.frf.faults import FaultReport, find_faults, worst_of
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.skew import correct_skew
 from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, stacked_spectra
@@ -72,7 +72,7 @@ class MeasurementFrf:
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
         self._notes: list[str] = []
-        self._faults: dict[tuple[FaultKind, str], Fault] = {}
+        self._faults = FaultReport()  # the worst of each kind that a single block shows
         self._first: Record | None = None
         self._last: Record | None = None
         self._contacts: list[tuple[Contact, float]] = []  # of each block, with its length [s]
@@ -114,7 +114,13 @@ class MeasurementFrf:
             self._played = excitation
         self._remember(record)
         block = Spectrum.of(u.reshape(-1, n), y.reshape(-1, n))
-        self._check(block, excitation)
+        found = find_faults(
+            block,
+            sample_rate_hz=excitation.sample_rate_hz,
+            harmonics=excitation.harmonics,
+            transient_removed=True,
+        )
+        self._faults = worst_of([[*self._faults.faults, *found.faults]])
         so_far = self._periods.setdefault(record.realisation, 0)
         if record.block_index * (u.size // n) != so_far:
             self._note(
@@ -138,7 +144,7 @@ class MeasurementFrf:
         delay_s = float("nan") if self._last is None else self._last.channel_delay_s
         if frf.g.size and np.isfinite(delay_s) and delay_s != 0:
             frf = correct_skew(replace(frf, bins=None, further_bins=()), delay_s)
-        frf = FaultReport(tuple(self._faults.values())).marked(frf)
+        frf = self._faults.marked(frf)
         return frf.suspected("; ".join(self._notes)) if self._notes else frf
 
     def origin(self) -> Origin:
@@ -242,20 +248,6 @@ class MeasurementFrf:
                 for band, of in in_bands
             ),
         )
-
-    def _check(self, block: Spectrum, excitation: Excitation) -> None:
-        """Keep the worst fault of each kind that a single block shows."""
-        report = find_faults(
-            block,
-            sample_rate_hz=excitation.sample_rate_hz,
-            harmonics=excitation.harmonics,
-            transient_removed=True,
-        )
-        for fault in report.faults:
-            key = fault.kind, fault.channel
-            known = self._faults.get(key)
-            if known is None or fault.value > known.value:
-                self._faults[key] = fault
 
     def _remember(self, record: Record) -> None:
         if self._first is None:
