@@ -248,9 +248,7 @@ def _distortion(distortion: Distortion | None) -> dict | None:
             "rms_level_db": known(float(lines.rms_level_db)),
             "rms_output_level_db": known(float(lines.rms_output_level_db)),
             "rms_input_level_db": known(float(lines.rms_input_level_db)),
-            "rms_noise_level_db": None
-            if lines.rms_noise_level_db is None
-            else known(float(lines.rms_noise_level_db)),
+            "rms_noise_level_db": known(float(lines.rms_noise_level_db)),
         }
         for name, lines in (("even", distortion.even), ("odd", distortion.odd))
     }

@@ -143,10 +143,9 @@ def draw_distortion_levels(cases: Mapping[float, Distortion], title: str) -> Fig
     for name, marker in (("even", "o-"), ("odd", "s-")):
         lines = [getattr(cases[level], name) for level in levels]
         axes.plot(levels, [float(np.max(x.rms_level_db)) for x in lines], marker, label=name)
-    noise = [cases[level].odd.rms_noise_level_db for level in levels]
-    known = [float(np.max(x)) for x in noise if x is not None]
-    if len(known) == len(levels):
-        axes.plot(levels, known, "k.--", label="noise at odd lines")
+    noise = [float(np.max(cases[level].odd.rms_noise_level_db)) for level in levels]
+    if not np.any(np.isnan(noise)):
+        axes.plot(levels, noise, "k.--", label="noise at odd lines")
     axes.set(
         xlabel="drive level [V rms]",
         ylabel="against the linear output in the band [dB]",
@@ -174,7 +173,7 @@ def _draw_case(axes: Axes, distortion: Distortion) -> None:
             label=_label(name, lines),
             **style,
         )
-        if lines.noise_power is not None and name == "even":
+        if name == "even" and not np.all(np.isnan(lines.noise_power)):
             axes.plot(
                 lines.frequency_hz, decibel(lines.noise_power), color="0.6", label="noise", **style
             )
