@@ -138,13 +138,8 @@ def neighbourhoods(
     Raises
     ------
     ValueError
-        If there is one period, or too few bins between harmonics for `order` and `dof`.
+        If there are too few bins between harmonics for `order` and `dof`; a single period has none.
     """
-    if periods < 2:
-        raise ValueError(
-            f"periods: {periods}, expected at least 2: a single period has no bins "
-            "between harmonics from which to estimate noise and transient"
-        )
     if order < 0:
         raise ValueError(f"order: {order}, expected at least 0")
     if dof < 1:

@@ -176,7 +176,7 @@ def test_a_single_period_has_no_covariance(multisine):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"periods": 1}, "periods: 1, expected at least 2"),
+        ({"periods": 1}, "a record of 1 x 50 samples has 0; lower either or record more"),
         ({"order": -1}, "order: -1"),
         ({"dof": 0}, "dof: 0"),
         ({"dof": 90}, "dof: 2, 90 need 94 bins between harmonics, .* has 50; lower either"),
