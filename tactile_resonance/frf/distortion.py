@@ -14,7 +14,7 @@ from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntAr
 from tactile_resonance.frf.estimate import mean_spectra
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, error_variance
-from tactile_resonance.multisine import Excitation, Grid
+from tactile_resonance.multisine import Grid
 
 DETECTING = (Grid.ODD, Grid.ODD_RANDOM)
 """Grids that leave lines out between those excited: what stands there is distortion."""
@@ -232,22 +232,6 @@ def nonlinear_distortion(
     )
 
 
-def band_lines(excitation: Excitation, band_hz: tuple[float, float]) -> IntArray:
-    """All harmonics from the first to the last excited one of a band, those left out between them included.
-
-    Raises
-    ------
-    ValueError
-        If the band holds no excited line.
-    """
-    low_hz, high_hz = band_hz
-    f = excitation.frequency_hz
-    excited = excitation.harmonics[(f >= low_hz) & (f <= high_hz)]
-    if excited.size == 0:
-        raise ValueError(f"bands: {low_hz:g} to {high_hz:g} Hz hold no excited line")
-    return np.arange(excited[0], excited[-1] + 1)
-
-
 def distortion_in_band(
     spectra: PeriodicSpectra,
     excited_harmonics: npt.ArrayLike,
@@ -260,14 +244,13 @@ def distortion_in_band(
     Parameters
     ----------
     spectra : PeriodicSpectra
-        At `band_lines`, (M, 2, H).
+        (M, 2, H), from the first to the last excited harmonic of the band.
     excited_harmonics : (F,) int
-        All that are excited; those of the band count.
+        Of the band.
     band_hz : (low, high)
     sample_rate_hz : float
     """
-    excited = np.intersect1d(np.asarray(excited_harmonics), spectra.harmonics)
-    found = nonlinear_distortion(spectra, excited, sample_rate_hz=sample_rate_hz)
+    found = nonlinear_distortion(spectra, excited_harmonics, sample_rate_hz=sample_rate_hz)
     values: dict[str, Any] = {}
     for name, lines in (("even", found.even), ("odd", found.odd)):
         values[f"{name}_db"] = float(lines.rms_level_db)

@@ -12,7 +12,7 @@ import numpy as np
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.force_spread import joined_spread
 from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
-from tactile_resonance.frf.distortion import DETECTING, band_lines, distortion_in_band
+from tactile_resonance.frf.distortion import DETECTING, distortion_in_band
 from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
 from tactile_resonance.frf.faults import FaultReport, find_faults, worst_of
 from tactile_resonance.frf.result import FRF, FrfStatus
@@ -64,6 +64,7 @@ class MeasurementFrf:
         self._bands: tuple[PoleBand, ...] = ()
         self._played: Excitation | None = None  # the first: all realisations excite the same lines
         self._lines: IntArray = np.empty(0, np.int64)
+        self._lines_of_bands: list[IntArray] = []  # where others between them show distortion
         self._samples: FloatArray = np.empty((2, 0, 0))  # (2, room, N), rows [y; u]
         # of each realisation; bins and lines that show distortion in each band
         self._spectra: dict[
@@ -110,6 +111,10 @@ class MeasurementFrf:
             if self._bands:
                 self._bins_bands_hz = tuple(band.ends_hz for band in self._bands)
             self._lines = self._lines_of(excitation)
+            self._lines_of_bands = [
+                _lines_in(excitation, band.ends_hz, "bands")
+                for band in (self._bands if excitation.grid in DETECTING else ())
+            ]
             self._samples = np.empty((2, excitation.periods, n))
             self._played = excitation
         self._remember(record)
@@ -171,7 +176,6 @@ class MeasurementFrf:
 
     def _lines_of(self, excitation: Excitation) -> IntArray:
         """Excited harmonics in the band."""
-        frequency_hz = excitation.frequency_hz
         line_hz = excitation.sample_rate_hz / excitation.samples_per_period
         for low_hz, high_hz in self._bins_bands_hz:
             top_hz = min(high_hz, excitation.sample_rate_hz / 2)
@@ -184,14 +188,7 @@ class MeasurementFrf:
                 )
         if self._band_hz is None:
             return excitation.harmonics
-        low_hz, high_hz = self._band_hz
-        lines = excitation.harmonics[(frequency_hz >= low_hz) & (frequency_hz <= high_hz)]
-        if lines.size == 0:
-            raise ValueError(
-                f"band_hz: {low_hz:g}..{high_hz:g} holds no excited line, they reach "
-                f"from {frequency_hz[0]:g} to {frequency_hz[-1]:g} Hz"
-            )
-        return lines
+        return _lines_in(excitation, self._band_hz, "band_hz")
 
     def _take(self, record: Spectrum, realisation: int, excitation: Excitation) -> None:
         """Periods (P, N) that follow those of the same realisation without a gap."""
@@ -218,8 +215,8 @@ class MeasurementFrf:
             bins = []
         # the first period is left out: what a polynomial leaves of the transient hides distortion
         detection = [
-            mean_spectra(record, band_lines(excitation, band.ends_hz), method="average")
-            for band in (self._bands if excitation.grid in DETECTING else ())
+            mean_spectra(record, np.arange(lines[0], lines[-1] + 1), method="average")
+            for lines in self._lines_of_bands
         ]
         self._spectra[realisation] = spectra, bins, detection
         self._periods[realisation] = periods
@@ -236,16 +233,15 @@ class MeasurementFrf:
         stacked = tuple(stacked_bins(of) for of in zip(*bins_of_each, strict=True))
         if any(of.u.size > MOST_BINS for of in stacked):
             stacked = ()
-        in_bands = zip(self._bands, zip(*detection_of_each, strict=True), strict=False)
+        of_bands = zip(*detection_of_each, strict=True)
+        in_bands = zip(self._bands, self._lines_of_bands, of_bands, strict=False)
         self._frf = replace(
             frf,
             bins=stacked[0] if stacked else None,
             further_bins=stacked[1:],
             distortion=tuple(
-                distortion_in_band(
-                    stacked_spectra(of), harmonics, band.ends_hz, sample_rate_hz=rate_hz
-                )
-                for band, of in in_bands
+                distortion_in_band(stacked_spectra(of), lines, band.ends_hz, sample_rate_hz=rate_hz)
+                for band, lines, of in in_bands
             ),
         )
 
@@ -262,6 +258,18 @@ class MeasurementFrf:
     def _note(self, text: str) -> None:
         if text not in self._notes:
             self._notes.append(text)
+
+
+def _lines_in(excitation: Excitation, band_hz: tuple[float, float], field: str) -> IntArray:
+    """Excited harmonics in a band."""
+    f, (low_hz, high_hz) = excitation.frequency_hz, band_hz
+    lines = excitation.harmonics[(f >= low_hz) & (f <= high_hz)]
+    if lines.size == 0:
+        raise ValueError(
+            f"{field}: {low_hz:g}..{high_hz:g} holds no excited line, they reach "
+            f"from {f[0]:g} to {f[-1]:g} Hz"
+        )
+    return lines
 
 
 def mean_force(blocks: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
