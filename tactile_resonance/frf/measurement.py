@@ -90,8 +90,8 @@ class MeasurementFrf:
         Raises
         ------
         ValueError
-            If the record does not fit the excitation, the band holds no line of it, or too many bins
-            would go with the FRF.
+            If the record does not fit the excitation, or this the first one, the band holds no line of it, or
+            too many bins would go with the FRF.
         """
         n = excitation.samples_per_period
         u, y = record.actuator.volts(), record.sensor.volts()
@@ -117,6 +117,14 @@ class MeasurementFrf:
             ]
             self._samples = np.empty((2, excitation.periods, n))
             self._played = excitation
+        played = self._played
+        if excitation.sample_rate_hz != played.sample_rate_hz or not np.array_equal(
+            excitation.harmonics, played.harmonics
+        ):
+            raise ValueError(
+                f"realisation: {record.realisation + 1} was played at another rate or on other lines than "
+                "the first record, expected the same"
+            )
         self._remember(record)
         block = Spectrum.of(u.reshape(-1, n), y.reshape(-1, n))
         found = find_faults(
@@ -133,7 +141,7 @@ class MeasurementFrf:
                 "not used from there on"
             )
         else:
-            self._take(block, record.realisation, self._played)
+            self._take(block, record.realisation, played)
         return self.frf()
 
     def frf(self) -> FRF:
