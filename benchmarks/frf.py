@@ -16,9 +16,9 @@ import matplotlib
 import numpy as np
 import scipy.fft
 
-from tactile_resonance._typing import FloatArray
-from tactile_resonance.frf.estimate import fast_frf, robust_frf
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance._typing import FloatArray, IntArray
+from tactile_resonance.frf.estimate import frf_of_realisations, frf_of_record
+from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
@@ -102,11 +102,10 @@ def measure_timing(repetitions: int) -> dict[str, tuple[float, Array, float | No
     # would double the time of the bare transform and flatter all ratios.
     np.ones(4_000_000)
     u, y = Plant(0.02, 40.0).records(np.random.default_rng(0), PERIODS)
-    u_single, y_single = u.astype(np.float32), y.astype(np.float32)
+    u_single, y_single = u.astype(np.float32)[None], y.astype(np.float32)[None]
     lines = design_multisine(sample_rate_hz=RATE_HZ, samples_per_period=SAMPLES).harmonics
     frequency = lines * (RATE_HZ / SAMPLES)
     inside = lines[(frequency >= BAND_HZ[0]) & (frequency <= BAND_HZ[1])]
-    plan, band_plan = (LocalPolynomialPlan(x, SAMPLES, PERIODS) for x in (lines, inside))
 
     def transform() -> tuple:
         return scipy.fft.rfft(u.ravel()), scipy.fft.rfft(y.ravel())
@@ -126,25 +125,29 @@ def measure_timing(repetitions: int) -> dict[str, tuple[float, Array, float | No
             live[0].add(block, excitation)
 
     record = Spectrum.of(u, y)
-    plan(record)
+    transient_free_spectra(record, lines)
+
+    def frf(u: Array, y: Array, lines: IntArray) -> FRF:
+        return frf_of_record(Spectrum.of(u, y), lines, sample_rate_hz=RATE_HZ)
+
     nothing: Callable = lambda: None  # noqa: E731
     tasks: dict[str, tuple[Callable, Callable, float | None]] = {
         "bare real FFT, 2 channels": (nothing, transform, None),
         "spectra of the record, 2 channels": (nothing, lambda: Spectrum.of(u, y).bins, None),
-        "local polynomial part alone": (nothing, lambda: plan(record), None),
+        "local polynomial part alone": (nothing, lambda: transient_free_spectra(record, lines), None),
         "whole FRF with covariance": (
             nothing,
-            lambda: fast_frf(plan(Spectrum.of(u, y)), sample_rate_hz=RATE_HZ),
+            lambda: frf(u[None], y[None], lines),
             1.3,
         ),
         "the same from float32 records": (
             nothing,
-            lambda: fast_frf(plan(Spectrum.of(u_single, y_single)), sample_rate_hz=RATE_HZ),
+            lambda: frf(u_single, y_single, lines),
             1.3,
         ),
         "FRF of 200-300 Hz": (
             nothing,
-            lambda: fast_frf(band_plan(Spectrum.of(u, y)), sample_rate_hz=RATE_HZ),
+            lambda: frf(u[None], y[None], inside),
             1.3,
         ),
         "live, 8th block: FRF, bins of 200-300 Hz, faults": (
@@ -186,30 +189,29 @@ def measure_accuracy(
     plants = [Plant(damping_ratio, snr_db, realisation) for realisation in range(2)]
     plant = plants[0]
     lines = plant.excitation.harmonics
-    plans = {order: LocalPolynomialPlan(lines, SAMPLES, PERIODS, order) for order in (2, 4, 6)}
-    short = LocalPolynomialPlan(lines, SAMPLES, PERIODS // 2)
     f = plant.excitation.frequency_hz
     inside = (f >= BAND_HZ[0]) & (f <= BAND_HZ[1])
     squares: dict[str, list[Array]] = {}
     stated: dict[str, list[Array]] = {}
     for seed in range(runs):
         rng = np.random.default_rng([seed, int(snr_db)])
-        u, y = plant.records(rng, PERIODS)
+        record = Spectrum.of(*(x[None] for x in plant.records(rng, PERIODS)))
         estimates: dict[str, FRF] = {
-            f"mean of {PERIODS - skip} periods" + (", the first dropped" if skip else ""): fast_frf(
-                averaged_spectra(Spectrum.of(u, y), lines, unsettled_periods=skip),
-                sample_rate_hz=RATE_HZ,
+            f"mean of {PERIODS - skip} periods" + (
+                ", the first dropped" if skip else ""
+            ): frf_of_realisations(
+                averaged_spectra(record, lines, unsettled_periods=skip), sample_rate_hz=RATE_HZ
             )
             for skip in (0, 1)
         }
-        for order, plan in plans.items():
-            estimates[f"fast, order {order}"] = fast_frf(
-                plan(Spectrum.of(u, y)), sample_rate_hz=RATE_HZ
+        for order in (2, 4, 6):
+            estimates[f"fast, order {order}"] = frf_of_record(
+                record, lines, sample_rate_hz=RATE_HZ, order=order
             )
         halves = [p.records(rng, PERIODS // 2) for p in plants]
         u, y = (np.stack(channel) for channel in zip(*halves, strict=True))
-        estimates[f"robust, 2 realisations of {PERIODS // 2} periods, order 2"] = robust_frf(
-            short(Spectrum.of(u, y)), sample_rate_hz=RATE_HZ
+        estimates[f"robust, 2 realisations of {PERIODS // 2} periods, order 2"] = frf_of_record(
+            Spectrum.of(u, y), lines, sample_rate_hz=RATE_HZ
         )
         for name, frf in estimates.items():
             variance = frf.variance_noise

@@ -22,7 +22,7 @@ from benchmarks.poles_plant import Plant, judge
 from benchmarks.stability_cells import cells
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.commands.benchmark import NAMES
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.structure import ModelStructure
@@ -190,9 +190,9 @@ def _scalings(rounds: int) -> list[Scaling]:
     rng = np.random.default_rng(0)
 
     def spectrum(samples: int, lines: int) -> Callable[[], object]:
-        plan = LocalPolynomialPlan(np.arange(4, 4 + lines), samples, 4)
+        harmonics = np.arange(4, 4 + lines)
         u, y = rng.standard_normal((2, 4, samples))
-        return lambda: plan(Spectrum.of(u, y))
+        return lambda: transient_free_spectra(Spectrum.of(u, y), harmonics)
 
     plant = Plant(0.02, 40.0, 2)
     u, y = plant.noisy(rng, 8192, plant.bins())

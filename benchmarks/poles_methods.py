@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,9 @@ from benchmarks.poles_plant import (
     Plant,
 )
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import ratio_variance
+from tactile_resonance.frf.spectra import error_variance, power, ratio
 from tactile_resonance.poles.identify import identify_batch, identify_frf
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.result import PolesBatch
@@ -81,17 +82,20 @@ def local_polynomial_spectra(
     """Lines [Hz], transient-free spectra (runs, 2, F), their covariance, degrees of freedom."""
     line_hz = SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD
     harmonics = np.arange(round(band_hz[0] / line_hz), round(band_hz[1] / line_hz) + 1)
-    plan = LocalPolynomialPlan(harmonics, SAMPLES_PER_PERIOD, plant.periods)
     whole = np.zeros((2, SAMPLES_PER_PERIOD * plant.periods // 2 + 1), complex)
     results = []
     for pair in np.stack(
         [y, u], axis=1
     ):  # (2, K), one run after the other: whole spectra are large
         whole[:, bins] = pair
-        results.append(plan.from_bins(whole))
+        # all of a Spectrum that is read: there are no samples
+        record: Any = SimpleNamespace(
+            bins=whole, periods=plant.periods, samples_per_period=SAMPLES_PER_PERIOD
+        )
+        results.append(transient_free_spectra(record, harmonics))
     spectra = np.stack([of.spectra for of in results])
     covariance = np.stack([of.covariance for of in results])
-    return harmonics * line_hz, spectra, covariance, plan.noise_dof
+    return harmonics * line_hz, spectra, covariance, results[0].noise_dof
 
 
 def compare_methods(quick: bool) -> list[Method]:
@@ -106,8 +110,8 @@ def compare_methods(quick: bool) -> list[Method]:
     frequency_hz, spectra, covariance, dof = local_polynomial_spectra(plant, u, y, wide)
     frf = FRF(
         frequency_hz,
-        spectra[:, 0] / spectra[:, 1],
-        variance_noise=ratio_variance(spectra, covariance),
+        ratio(spectra),
+        variance_noise=error_variance(ratio(spectra), covariance) / power(spectra[:, 1]),
         noise_dof=dof,
     )
     records = np.random.default_rng(0).standard_normal((10, 2, 8 * SAMPLES_PER_PERIOD))

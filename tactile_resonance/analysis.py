@@ -7,10 +7,11 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import band, known, number, require, require_kind
 from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.distortion import Distortion, estimate_distortion
@@ -210,15 +211,11 @@ def analysis_as_json(analysis: Analysis) -> str:
                 "imag_rad_s": float(pole.imag),
                 "f0_hz": float(poles.f0_hz[k]),
                 "damping_ratio": float(poles.damping_ratio[k]),
-                "covariance": _list(None if poles.covariance is None else poles.covariance[k]),
-                "total_covariance": _list(
-                    None if poles.total_covariance is None else poles.total_covariance[k]
-                ),
+                "covariance": _entry(poles.covariance, k),
+                "total_covariance": _entry(poles.total_covariance, k),
                 "f0_drift_hz_per_s": _entry(poles.f0_drift_hz_per_s, k),
                 "damping_drift_per_s": _entry(poles.damping_drift_per_s, k),
-                "drift_covariance": _list(
-                    None if poles.drift_covariance is None else poles.drift_covariance[k]
-                ),
+                "drift_covariance": _entry(poles.drift_covariance, k),
             }
             for k, pole in enumerate(poles.poles_rad_s)
         ],
@@ -251,20 +248,15 @@ def _distortion(distortion: Distortion | None) -> dict | None:
             "rms_level_db": known(float(lines.rms_level_db)),
             "rms_output_level_db": known(float(lines.rms_output_level_db)),
             "rms_input_level_db": known(float(lines.rms_input_level_db)),
-            "rms_noise_level_db": None
-            if lines.rms_noise_level_db is None
-            else known(float(lines.rms_noise_level_db)),
+            "rms_noise_level_db": known(float(lines.rms_noise_level_db)),
         }
         for name, lines in (("even", distortion.even), ("odd", distortion.odd))
     }
 
 
-def _list(array: npt.NDArray[np.floating] | None) -> list | None:
-    return None if array is None or not np.all(np.isfinite(array)) else array.tolist()
-
-
-def _entry(values: npt.NDArray[np.floating] | None, k: int) -> float | None:
-    return None if values is None else known(values[k])
+def _entry(values: FloatArray | None, k: int) -> Any:
+    """Number or lists of the k-th mode; None where something of it is not known."""
+    return None if values is None or not np.all(np.isfinite(values[k])) else values[k].tolist()
 
 
 # Half width of the band in units of the resonance's own half width: wide enough to see the mode die

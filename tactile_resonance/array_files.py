@@ -71,7 +71,7 @@ def read_arrays(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]
     OSError
         If it cannot be opened.
     """
-    readers = {".npz": read_npz, ".mat": _read_mat, ".csv": _read_csv}
+    readers = {".npz": _read_npz, ".mat": _read_mat, ".csv": _read_csv}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise ValueError(f"{path.name}: no record, accepted are {ACCEPTED}")
@@ -84,30 +84,21 @@ def read_arrays(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]
     return reader(path, wanted)
 
 
-def read_npz(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
-    """`read_arrays` of an .npz file, whatever its suffix."""
+def _read_npz(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
     try:
-        if not zipfile.is_zipfile(path):
-            raise ValueError("not a zip archive")
-        with np.load(path, allow_pickle=False) as archive:
-            names = list(archive.files)
-            held = [name for name in names if name in wanted]
-            sizes = {info.filename: info.file_size for info in archive.zip.infolist()}
-            most = max((sizes[_member(name, sizes)] for name in held), default=0)
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            held = {name: info for name, info in members.items() if name in wanted}
+            most = max((info.file_size for info in held.values()), default=0)
             if most > MOST_BYTES:
                 raise ValueError(f"an array of {most / 1e9:.1f} GB, accepted are 4 GiB")
-            arrays = {name: _array(archive.zip, _member(name, sizes)) for name in held}
-        return {name: a for name, a in arrays.items() if a.dtype.kind in _NUMBERS}, names
+            arrays = {name: _array(archive, info) for name, info in held.items()}
+        return {name: a for name, a in arrays.items() if a.dtype.kind in _NUMBERS}, list(members)
     except Exception as error:  # whatever zipfile and numpy meet in a damaged file
         raise ValueError(f"{path.name}: no .npz record ({_reason(error)})") from error
 
 
-def _member(name: str, sizes: Mapping[str, int]) -> str:
-    """Name in the archive of what numpy calls `name`."""
-    return f"{name}.npy" if f"{name}.npy" in sizes else name
-
-
-def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     """One array; what its header promises is compared with what is there before memory is taken."""
     with archive.open(member) as file:
         version = np.lib.format.read_magic(file)
@@ -118,9 +109,11 @@ def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
         if version not in header:
             raise ValueError(f"array format {version}")
         shape, _, dtype = header[version](file)
-        promised, there = int(np.prod(shape, dtype=float)) * dtype.itemsize, archive.getinfo(member)
-        if promised > there.file_size:
-            raise ValueError(f"{member} promises {promised} bytes and holds {there.file_size}")
+        promised = int(np.prod(shape, dtype=float)) * dtype.itemsize
+        if promised > member.file_size:
+            raise ValueError(
+                f"{member.filename} promises {promised} bytes and holds {member.file_size}"
+            )
     with archive.open(member) as file:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 

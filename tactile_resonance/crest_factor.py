@@ -13,9 +13,7 @@ from tactile_resonance.multisine import Excitation
 FIRST_CLIP, LAST_CLIP = 0.75, 0.99
 
 
-def compress_crest_factor(
-    excitation: Excitation, *, passes: int = 300, oversampling: int = 1
-) -> Excitation:
+def compress_crest_factor(excitation: Excitation, *, passes: int = 300) -> Excitation:
     """The same lines and amplitudes with phases that make the peaks small.
 
     Parameters
@@ -24,8 +22,6 @@ def compress_crest_factor(
         A single realisation.
     passes : int
         Clipping passes; each costs two FFTs of a period.
-    oversampling : int
-        Peaks between samples count where this is above 1.
 
     Returns
     -------
@@ -49,9 +45,9 @@ def compress_crest_factor(
             f"realisations: {excitation.realisations}, compressed phases are not random, so several "
             "realisations would not show nonlinear distortion; accepted is 1"
         )
-    if passes < 1 or oversampling < 1:
-        raise ValueError(f"passes, oversampling: {passes}, {oversampling}, expected at least 1")
-    n = excitation.samples_per_period * oversampling
+    if passes < 1:
+        raise ValueError(f"passes: {passes}, expected at least 1")
+    n = excitation.samples_per_period
     lines, amplitude = excitation.harmonics, excitation.amplitude_v
     spectrum = np.zeros(n // 2 + 1, complex)
     phasor = np.exp(1j * excitation.phase_rad)

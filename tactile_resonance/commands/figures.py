@@ -113,9 +113,9 @@ def _variance(output: Path) -> None:
     frequency_hz = harmonics * rate_hz / u.shape[-1]
     places = np.indices(g.shape[:-1]).reshape(g.ndim - 1, -1)
     groups, g = np.stack([0 * places[0], *places[:-1]], axis=1), g.reshape(-1, frequency_hz.size)
-    whole, band = print_variance(g, frequency_hz, groups, BAND_HZ)
+    found = print_variance(g, frequency_hz, groups, BAND_HZ)
     title = f"Variance of the FRF by source (gelatine 12 %, {SIMULATED})"
-    save_figure(draw_variance(whole, band, BAND_HZ, title), output / "variance.png")
+    save_figure(draw_variance(found, frequency_hz, BAND_HZ, title), output / "variance.png")
     print(f"figure in {output}: variance.png")
 
 

@@ -15,7 +15,7 @@ from tactile_resonance.files import write_whole
 
 if TYPE_CHECKING:
     from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
-    from tactile_resonance.frf.variance_analysis import VarianceAnalysis
+    from tactile_resonance.frf.variance_analysis import NestedMeans
     from tactile_resonance.scan.labels import LabelOf
     from tactile_resonance.scan.point_result import PointResult
     from tactile_resonance.scan.run_content import RunContent
@@ -194,30 +194,30 @@ def _variance(options: argparse.Namespace) -> int:
     band_hz = scene_band(options.runs[0]).ends_hz
     g, lines_hz, groups, left_out = labelled_frfs(runs, _labels(options.labels, runs))
     print_left_out(left_out)
-    whole, band = print_variance(g, lines_hz, groups, band_hz)
+    found = print_variance(g, lines_hz, groups, band_hz)
     if options.figure:
         title = "Variance of the FRF by source" + (f", {SIMULATED}" if _simulated(runs) else "")
-        save_figure(draw_variance(whole, band, band_hz, title), options.figure)
+        save_figure(draw_variance(found, lines_hz, band_hz, title), options.figure)
     return 0
 
 
 def print_variance(
     g: ComplexArray, frequency_hz: FloatArray, groups: IntArray, band_hz: tuple[float, float]
-) -> tuple[VarianceAnalysis, VarianceAnalysis]:
-    """Variance by source over all lines and in a band, of which it prints the sources."""
-    from tactile_resonance.frf.variance_analysis import analyse_variance
+) -> NestedMeans:
+    """Variance by source, of which it prints those of a band."""
+    from tactile_resonance.frf.variance_analysis import PAPER_AXES, nested_means
 
     inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
-    whole = analyse_variance(g, frequency_hz, groups)
-    band = analyse_variance(g[:, inside], frequency_hz[inside], groups)
-    for source in reversed(band.sources):
+    found = nested_means(g, groups, PAPER_AXES)
+    for source in reversed(found.levels):
+        level_db = found.rms_level_db(source, inside)
         print(
-            f"over {source.name}: {source.rms_level_db:.1f} dB of rms |G| at {band_hz[0]:g}-{band_hz[1]:g} Hz, "
+            f"over {source.name}: {level_db:.1f} dB of rms |G| at {band_hz[0]:g}-{band_hz[1]:g} Hz, "
             f"{source.dof} degrees of freedom"
             if source.dof
             else f"over {source.name}: not determined, one of each"
         )
-    return whole, band
+    return found
 
 
 def _check_level(level: float) -> None:

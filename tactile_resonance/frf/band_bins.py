@@ -72,27 +72,12 @@ class BandBins:
         return first * self.resolution_hz, (first + self.count - 1) * self.resolution_hz
 
 
-def stacked_bins(realisations: Sequence[BandBins | None]) -> BandBins | None:
-    """Of several realisations; None where they differ in lines or periods, or one has none."""
-    each = [bins for bins in realisations if bins is not None]
-    if len(each) < len(realisations):
-        return None
-    first = each[0]
-    for other in each[1:]:
-        alike = (
-            other.periods == first.periods
-            and other.samples_per_period == first.samples_per_period
-            and other.sample_rate_hz == first.sample_rate_hz
-            and other.first_bin == first.first_bin
-            and other.count == first.count
-            and np.array_equal(other.harmonics, first.harmonics)
-        )
-        if not alike:
-            return None
+def stacked_bins(realisations: Sequence[BandBins]) -> BandBins:
+    """Of several realisations of as many periods and bins."""
     return replace(
-        first,
-        u=np.concatenate([bins.u for bins in each]),
-        y=np.concatenate([bins.y for bins in each]),
+        realisations[0],
+        u=np.concatenate([bins.u for bins in realisations]),
+        y=np.concatenate([bins.y for bins in realisations]),
     )
 
 

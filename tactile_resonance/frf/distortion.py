@@ -14,7 +14,7 @@ from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntAr
 from tactile_resonance.frf.estimate import mean_spectra
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, error_variance
-from tactile_resonance.multisine import Excitation, Grid
+from tactile_resonance.multisine import Grid
 
 DETECTING = (Grid.ODD, Grid.ODD_RANDOM)
 """Grids that leave lines out between those excited: what stands there is distortion."""
@@ -38,8 +38,8 @@ class DetectionLines:
         Mean spectra Y and U [V].
     corrected : complex
         ``Y - G U``: the output without what the input's own distortion causes linearly.
-    corrected_variance : float or None
-        Its noise variance; None for single periods.
+    corrected_variance : float
+        Its noise variance; NaN for single periods.
     linear_output_power, excited_input_power : (..., L) float
         Power of output and input at the excited lines around, averaged over realisations: what the
         levels refer to. NaN outside the excited band.
@@ -52,7 +52,7 @@ class DetectionLines:
     output: ComplexArray
     input: ComplexArray
     corrected: ComplexArray
-    corrected_variance: FloatArray | None
+    corrected_variance: FloatArray
     linear_output_power: FloatArray
     excited_input_power: FloatArray
     noise_dof: int
@@ -68,10 +68,8 @@ class DetectionLines:
         return np.mean(np.abs(self.corrected) ** 2, axis=-2)
 
     @property
-    def noise_power(self) -> FloatArray | None:
-        """(..., L) noise in `power`; None where unknown."""
-        if self.corrected_variance is None:
-            return None
+    def noise_power(self) -> FloatArray:
+        """(..., L) noise in `power`; NaN where unknown."""
         return np.mean(self.corrected_variance, axis=-2)
 
     @property
@@ -91,12 +89,9 @@ class DetectionLines:
         return _rms_ratio_db(power, self.linear_output_power, self.in_band)
 
     @property
-    def rms_noise_level_db(self) -> FloatArray | None:
-        """(...) the same for noise; None where unknown."""
-        noise = self.noise_power
-        if noise is None:
-            return None
-        return _rms_ratio_db(noise, self.linear_output_power, self.in_band)
+    def rms_noise_level_db(self) -> FloatArray:
+        """(...) the same for noise; NaN where unknown."""
+        return _rms_ratio_db(self.noise_power, self.linear_output_power, self.in_band)
 
     @property
     def rms_input_level_db(self) -> FloatArray:
@@ -110,12 +105,11 @@ class DetectionLines:
 
         None where it cannot be estimated: single periods, or no line of this parity.
         """
-        noise = self.noise_power
         inside = self.in_band
-        if noise is None or not np.any(inside):
+        noise = self.noise_power[..., inside]
+        if noise.size == 0 or np.any(np.isnan(noise)):
             return None
         realisations = self.corrected.shape[-2]
-        noise = noise[..., inside]
         total = noise.sum(axis=-1)
         # degrees of freedom of a sum of unequal powers (Satterthwaite); E of a squared estimate is
         # larger than the square by (1 + 1 / dof)
@@ -133,7 +127,7 @@ class Distortion:
     Attributes
     ----------
     frequency_hz : (F,) float
-    output, input : (..., M, F) complex
+    output : (..., M, F) complex
         Mean spectra at the excited lines [V].
     even, odd : DetectionLines
         `odd` has no lines for a grid that excites every odd harmonic.
@@ -141,7 +135,6 @@ class Distortion:
 
     frequency_hz: FloatArray
     output: ComplexArray
-    input: ComplexArray
     even: DetectionLines
     odd: DetectionLines
 
@@ -193,7 +186,7 @@ def nonlinear_distortion(
     ----------
     spectra : PeriodicSpectra
         At all harmonics of interest, excited or not, (..., M, 2, H): from
-        `spectra.averaged_spectra` in steady state or `local_polynomial.LocalPolynomialPlan` (which
+        `spectra.averaged_spectra` in steady state or `local_polynomial.transient_free_spectra` (which
         leaves harmonics alone when it estimates noise).
     excited_harmonics : (F,) int
         Odd harmonics, part of `spectra.harmonics`.
@@ -206,8 +199,8 @@ def nonlinear_distortion(
     Raises
     ------
     ValueError
-        If an even harmonic is excited (its mixing products do not keep to a parity), there is no
-        detection line, or shapes do not fit.
+        If an even harmonic is excited (its mixing products do not keep to a parity), or there is no
+        detection line.
 
     Notes
     -----
@@ -219,10 +212,6 @@ def nonlinear_distortion(
     Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
     chapter 4 (fast method, detection lines, correction for the input).
     """
-    if spectra.spectra.ndim < 3:
-        raise ValueError(
-            f"spectra: shape {spectra.spectra.shape}, expected (..., M, 2, H) with realisations M"
-        )
     excited = spectra.at(excited_harmonics)
     if np.any(excited.harmonics % 2 == 0):
         raise ValueError(
@@ -235,30 +224,12 @@ def nonlinear_distortion(
             "spectra: only excited harmonics, expected those between them too: they show the "
             "distortion"
         )
-    y, u = excited.spectra[..., 0, :], excited.spectra[..., 1, :]  # (..., M, F)
     return Distortion(
         frequency_hz=excited.frequency_hz(sample_rate_hz),
-        output=y,
-        input=u,
+        output=excited.spectra[..., 0, :],
         even=_detection_lines(spectra.at(detection[detection % 2 == 0]), excited, sample_rate_hz),
         odd=_detection_lines(spectra.at(detection[detection % 2 == 1]), excited, sample_rate_hz),
     )
-
-
-def band_lines(excitation: Excitation, band_hz: tuple[float, float]) -> IntArray:
-    """All harmonics from the first to the last excited one of a band, those left out between them included.
-
-    Raises
-    ------
-    ValueError
-        If the band holds no excited line.
-    """
-    low_hz, high_hz = band_hz
-    f = excitation.frequency_hz
-    excited = excitation.harmonics[(f >= low_hz) & (f <= high_hz)]
-    if excited.size == 0:
-        raise ValueError(f"bands: {low_hz:g} to {high_hz:g} Hz hold no excited line")
-    return np.arange(excited[0], excited[-1] + 1)
 
 
 def distortion_in_band(
@@ -273,20 +244,18 @@ def distortion_in_band(
     Parameters
     ----------
     spectra : PeriodicSpectra
-        At `band_lines`, (M, 2, H).
+        (M, 2, H), from the first to the last excited harmonic of the band.
     excited_harmonics : (F,) int
-        All that are excited; those of the band count.
+        Of the band.
     band_hz : (low, high)
     sample_rate_hz : float
     """
-    excited = np.intersect1d(np.asarray(excited_harmonics), spectra.harmonics)
-    found = nonlinear_distortion(spectra, excited, sample_rate_hz=sample_rate_hz)
+    found = nonlinear_distortion(spectra, excited_harmonics, sample_rate_hz=sample_rate_hz)
     values: dict[str, Any] = {}
     for name, lines in (("even", found.even), ("odd", found.odd)):
-        noise_db, above = lines.rms_noise_level_db, lines.above_noise
         values[f"{name}_db"] = float(lines.rms_level_db)
-        values[f"{name}_noise_db"] = float("nan") if noise_db is None else float(noise_db)
-        values[f"{name}_above_noise"] = bool(above) if above is not None else False
+        values[f"{name}_noise_db"] = float(lines.rms_noise_level_db)
+        values[f"{name}_above_noise"] = bool(lines.above_noise)
         values[f"input_{name}_db"] = float(lines.rms_input_level_db)
     return BandDistortion(*band_hz, **values)
 
@@ -298,34 +267,25 @@ def _detection_lines(
     y_excited, u_excited = excited.spectra[..., 0, :], excited.spectra[..., 1, :]  # (..., M, F)
 
     def at_lines(values: npt.NDArray) -> npt.NDArray:
-        return _interpolate(excited.harmonics, values, lines.harmonics)
+        """(..., L) linear interpolation of (..., F); NaN outside the excited band."""
+        return np.apply_along_axis(
+            lambda row: np.interp(lines.harmonics, excited.harmonics, row, np.nan, np.nan), -1, values
+        )
 
     g = at_lines(y_excited / u_excited)  # (..., M, L)
-    corrected_variance = None
-    if lines.covariance is not None:
-        corrected_variance = error_variance(g, lines.covariance)
     return DetectionLines(
         harmonics=lines.harmonics,
         frequency_hz=lines.frequency_hz(sample_rate_hz),
         output=y,
         input=u,
         corrected=y - g * u,
-        corrected_variance=corrected_variance,
+        corrected_variance=np.full(g.shape, np.nan)
+        if lines.covariance is None
+        else error_variance(g, lines.covariance),
         linear_output_power=at_lines(np.mean(np.abs(y_excited) ** 2, axis=-2)),
         excited_input_power=at_lines(np.mean(np.abs(u_excited) ** 2, axis=-2)),
         noise_dof=lines.noise_dof,
     )
-
-
-def _interpolate(x: IntArray, values: npt.NDArray, at: IntArray) -> npt.NDArray:
-    """(..., L) linear interpolation of (..., F); NaN outside of x."""
-    right = np.clip(np.searchsorted(x, at), 1, max(x.size - 1, 1))
-    if x.size == 1:  # nothing lies between excited lines
-        return np.full((*values.shape[:-1], at.size), np.nan, values.dtype)
-    weight = (at - x[right - 1]) / (x[right] - x[right - 1])
-    result = values[..., right - 1] * (1 - weight) + values[..., right] * weight
-    result[..., (at < x[0]) | (at > x[-1])] = np.nan
-    return result
 
 
 def _sentence(name: str, lines: DetectionLines) -> str:
@@ -336,10 +296,10 @@ def _sentence(name: str, lines: DetectionLines) -> str:
         f"{name.capitalize()} lines: output {raw:.1f} dB against the linear output (rms), "
         f"{level:.1f} dB corrected for the input's own distortion"
     )
-    noise = lines.rms_noise_level_db
-    if noise is None:
+    noise = float(np.max(lines.rms_noise_level_db))
+    if np.isnan(noise):
         return text + "; noise level unknown (single periods)."
-    text += f"; noise {float(np.max(noise)):.1f} dB"
+    text += f"; noise {noise:.1f} dB"
     return text + ("." if np.any(lines.above_noise) else ": nothing above noise.")
 
 

@@ -3,27 +3,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray
-from tactile_resonance.frf.local_polynomial import kept_plan
+from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.realisations import Agreement, transient_lines
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.spectra import (
     PeriodicSpectra,
     Spectrum,
     averaged_spectra,
-    checked_harmonics,
     conditional_variance,
     error_variance,
     power,
     ratio,
-    ratio_variance,
 )
 
 METHODS = ("local polynomial", "average")
@@ -58,7 +54,7 @@ def frf_of_record(
         How the transient is dealt with: estimated and removed, or waited for: ``average`` drops the
         first of three periods or more. A single period is taken as settled by either.
     order, dof : int
-        See `local_polynomial.LocalPolynomialPlan`.
+        See `local_polynomial.transient_free_spectra`.
 
     Returns
     -------
@@ -86,73 +82,13 @@ def mean_spectra(
     """Mean spectra (..., 2, F) of a record; parameters are those of `frf_of_record`."""
     if method not in METHODS:
         raise ValueError(f"method: {method!r}, accepted are {', '.join(METHODS)}")
-    samples, periods = record.samples_per_period, record.periods
-    lines = checked_harmonics(harmonics, samples)
-    if periods > 1 and method == "local polynomial":
-        return kept_plan(lines.tobytes(), samples, periods, order, dof)(record)
-    return averaged_spectra(record, lines, unsettled_periods=1 if periods > 2 else 0)
+    if record.periods > 1 and method == "local polynomial":
+        return transient_free_spectra(record, harmonics, order=order, dof=dof)
+    return averaged_spectra(record, harmonics, unsettled_periods=1 if record.periods > 2 else 0)
 
 
 def frf_of_realisations(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
-    """FRF from mean spectra (..., M, 2, F), of one realisation or of several."""
-    if spectra.spectra.ndim < 3:
-        raise ValueError(
-            f"spectra: shape {spectra.spectra.shape}, expected (..., M, 2, F) with realisations M"
-        )
-    if spectra.spectra.shape[-3] > 1:
-        return robust_frf(spectra, sample_rate_hz=sample_rate_hz)
-    covariance = spectra.covariance
-    only = replace(
-        spectra,
-        spectra=spectra.spectra[..., 0, :, :],
-        covariance=None if covariance is None else covariance[..., 0, :, :, :],
-    )
-    return fast_frf(only, sample_rate_hz=sample_rate_hz)
-
-
-def fast_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
-    """FRF and its noise variance from the mean spectra of one realisation.
-
-    Parameters
-    ----------
-    spectra : PeriodicSpectra
-        From `local_polynomial.LocalPolynomialPlan` (transient removed) or
-        `averaged_spectra`.
-    sample_rate_hz : float
-
-    Returns
-    -------
-    FRF
-        Status NO_COVARIANCE for a single period; SUSPECT where the input is too weak at a line for
-        the ratio Y/U to be unbiased.
-
-    Notes
-    -----
-    With noise on the input the ratio is biased and its variance formula too small where the mean
-    input is not well above its noise: the relative bias is ``-exp(-|U|^2 / var U)`` for
-    Gaussian noise, below 5e-5 at 10 dB (Pintelon & Schoukens 2012, chapter 2).
-    """
-    variance = given = None
-    if spectra.covariance is not None:
-        variance = ratio_variance(spectra.spectra, spectra.covariance)
-        given = conditional_variance(spectra.covariance)
-    status, message = response_status(spectra.spectra, spectra.covariance)
-    return FRF(
-        frequency_hz=spectra.frequency_hz(sample_rate_hz),
-        g=ratio(spectra.spectra),
-        variance_noise=variance,
-        noise_dof=spectra.noise_dof,
-        actuator_amplitude=np.abs(spectra.spectra[..., 1, :]),
-        sensor_variance_given_actuator=given,
-        periods=spectra.periods,
-        method=spectra.method,
-        status=status,
-        message=message,
-    )
-
-
-def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
-    """Best linear approximation from the mean spectra of M realisations.
+    """FRF from the mean spectra of one realisation, or best linear approximation from those of several.
 
     Each gives its own FRF, ``G_m = Y_m / U_m``; G is their mean. Several phase realisations
     distinguish stochastic nonlinear distortion from noise: `FRF.variance_distortion`.
@@ -160,50 +96,63 @@ def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
     Parameters
     ----------
     spectra : PeriodicSpectra
-        With spectra (..., M, 2, F), M >= 2, from `local_polynomial.LocalPolynomialPlan` (transient
-        removed) or `averaged_spectra` (steady state; a single period is enough).
+        With spectra (..., M, 2, F), from `local_polynomial.transient_free_spectra` or
+        `averaged_spectra` (steady state; of several realisations a single period is enough).
     sample_rate_hz : float
+
+    Returns
+    -------
+    FRF
+        Status NO_COVARIANCE for a single period of one realisation; SUSPECT where the input is too weak at
+        a line for the ratio Y/U to be unbiased.
 
     Raises
     ------
     ValueError
-        For fewer than two realisations.
+        For spectra without an axis of realisations.
 
     Notes
     -----
     The noise variance is that of the mean noise covariance over realisations, at the mean G, over
     the mean input power, ``(C_YY + |G|^2 C_UU - 2 Re(C_YU conj G)) / (M^2 mean |U|^2)``, sums over
-    m understood; the total variance is the sample variance over realisations. Random phases and
-    equal amplitude spectra of all realisations are presumed. `total_dof` is M - 1: the total
-    variance of few realisations is itself uncertain.
+    m understood: to first order in the noise. The total variance is the sample variance over realisations.
+    Random phases and equal amplitude spectra of all realisations are presumed. `total_dof` is M - 1: the
+    total variance of few realisations is itself uncertain.
+
+    With noise on the input the ratio is biased and its variance formula too small where the mean
+    input is not well above its noise: the relative bias is ``-exp(-|U|^2 / var U)`` for
+    Gaussian noise, below 5e-5 at 10 dB.
 
     References
     ----------
     Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
-    chapter 4; Pintelon, Barbe, Vandersteen & Schoukens, MSSP 25 (2011) 2683-2704 (with
+    chapters 2 and 4; Pintelon, Barbe, Vandersteen & Schoukens, MSSP 25 (2011) 2683-2704 (with
     transients).
     """
     each = spectra.spectra  # (..., M, 2, F)
-    if each.ndim < 3 or each.shape[-3] < 2:
+    if each.ndim < 3:
         raise ValueError(
-            f"spectra: shape {each.shape}, expected (..., M, 2, F) with M >= 2 realisations; "
-            "one realisation cannot distinguish distortion from the system"
+            f"spectra: shape {each.shape}, expected (..., M, 2, F) with realisations M"
         )
     realisations = each.shape[-3]
-    g_each = ratio(each)  # (..., M, F)
+    several = realisations > 1
+    g_each, input_power = ratio(each), power(each[..., 1, :])  # (..., M, F)
     g = g_each.mean(axis=-2)
-    variance_total = np.var(g_each, axis=-2, ddof=1) / realisations
-    variance_noise = given = None
+    variance_total = np.var(g_each, axis=-2, ddof=1) / realisations if several else None
+    variance_noise = given = differ = None
     if spectra.covariance is not None:
         noise = spectra.covariance.mean(axis=-4) / realisations  # (..., 2, 2, F)
         given = conditional_variance(noise)
-        variance_noise = error_variance(g, noise) / np.mean(power(each[..., 1, :]), axis=-2)
+        variance_noise = error_variance(g, noise) / input_power.mean(axis=-2)
+        if variance_total is not None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                differ = np.median(variance_total / variance_noise, axis=-1).reshape(-1)
     frequency_hz = spectra.frequency_hz(sample_rate_hz)
-    differ = None
-    if variance_noise is not None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            differ = np.median(variance_total / variance_noise, axis=-1).reshape(-1)
-    status, message = _robust_status(each, spectra.covariance, g, g_each, frequency_hz, differ)
+    contradiction = _contradiction(spectra, g, g_each, frequency_hz, differ) if several else ""
+    if contradiction:
+        status, message = FrfStatus.MODEL_ERROR, contradiction
+    else:
+        status, message = _response_status(input_power, spectra.covariance)
     return FRF(
         frequency_hz=frequency_hz,
         g=g,
@@ -211,30 +160,28 @@ def robust_frf(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> FRF:
         variance_total=variance_total,
         noise_dof=realisations * spectra.noise_dof,
         total_dof=realisations - 1,
+        actuator_amplitude=None if several else np.abs(each[..., 0, 1, :]),
         sensor_variance_given_actuator=given,
         periods=spectra.periods,
         realisations=realisations,
-        method=f"robust method, {spectra.method}",
+        method=f"robust method, {spectra.method}" if several else spectra.method,
         status=status,
         message=message,
     )
 
 
-def response_status(
-    spectra: ComplexArray, covariance: ComplexArray | None
+def _response_status(
+    input_power: FloatArray, covariance: ComplexArray | None
 ) -> tuple[FrfStatus, str]:
-    """Whether the ratio Y/U of mean spectra can be relied on.
-
-    Parameters
-    ----------
-    spectra : (..., 2, F) complex
-        [Y; U].
-    covariance : (..., 2, 2, F) complex or None
-        Noise covariance of these.
-    """
-    if covariance is None:
+    """Whether Y/U of mean spectra of that input power (..., M, F) and noise can be relied on."""
+    if covariance is None and input_power.shape[-2] == 1:
         return FrfStatus.NO_COVARIANCE, "one period of one realisation: no covariance"
-    input_power = power(spectra[..., 1, :])  # (..., F)
+    if covariance is None:
+        return (
+            FrfStatus.OK,
+            "one period per realisation: noise and distortion are not distinguished, the variance over "
+            "realisations holds both",
+        )
     silent = int(np.count_nonzero(input_power == 0))
     if silent:
         return (
@@ -284,31 +231,22 @@ def with_narrow_modes_judged(frf: FRF) -> FRF:
     )
 
 
-def _robust_status(
-    each: ComplexArray,
-    covariance: ComplexArray | None,
+def _contradiction(
+    spectra: PeriodicSpectra,
     g: ComplexArray,
     g_each: ComplexArray,
     frequency_hz: FloatArray,
     differ: FloatArray | None,
-) -> tuple[FrfStatus, str]:
-    where = transient_lines(each, g) if covariance is None else None
+) -> str:
+    """Why the realisations are not of one system in steady state, for people; empty where they are."""
+    each = spectra.spectra
+    where = transient_lines(each, g) if spectra.covariance is None else None
     if where is not None:
         ends_hz = frequency_hz[where][[0, -1]]
         return (
-            FrfStatus.MODEL_ERROR,
             f"a transient at {ends_hz[0]:g} to {ends_hz[1]:g} Hz, or a drift, or a tone between lines: what "
             "the realisations differ by is alike on neighbouring lines, which noise and distortion are not; "
-            "record two periods or more of each, or wait before the record",
+            "record two periods or more of each, or wait before the record"
         )
     g_each, u = (x.reshape(-1, *g_each.shape[-2:]) for x in (g_each, each[..., 1, :]))
-    remarks = list(filter(None, Agreement.of(g_each, u, differ).remarks()))
-    if remarks:
-        return FrfStatus.MODEL_ERROR, remarks[0]
-    if covariance is not None:
-        return response_status(each, covariance)
-    return (
-        FrfStatus.OK,
-        "one period per realisation: noise and distortion are not distinguished, the variance over "
-        "realisations holds both",
-    )
+    return next(filter(None, Agreement.of(g_each, u, differ).remarks()), "")

@@ -83,18 +83,16 @@ def find_excited_harmonics(record: Spectrum) -> IntArray:
         )
     odd = harmonics % 2 == 1
     # an odd grid is looked for first, so that hum on an even line cannot pass for excitation
-    cut_db = _cut_level(level_db, candidate, odd, needs_step=periods == 1)
-    if cut_db is not None:
-        excited = candidate & (level_db > cut_db)
-        if np.sum(excited & ~odd) <= _STRAY_SHARE * np.sum(excited & odd):
-            return harmonics[excited & odd].astype(np.int64)
-    cut_db = _cut_level(level_db, candidate, np.ones_like(odd), needs_step=periods == 1)
-    if cut_db is None:
-        raise ValueError(
-            f"u: a single period, and no step of {GAP_DB:g} dB between excited lines and noise; "
-            "give the excited harmonics"
-        )
-    return harmonics[candidate & (level_db > cut_db)].astype(np.int64)
+    for grid, most_beside in ((odd, _STRAY_SHARE), (np.ones_like(odd), 0.0)):
+        cut_db = _cut_level(level_db, candidate, grid, needs_step=periods == 1)
+        if cut_db is not None:
+            excited = candidate & (level_db > cut_db)
+            if np.sum(excited & ~grid) <= most_beside * np.sum(excited & grid):
+                return harmonics[excited & grid]
+    raise ValueError(
+        f"u: a single period, and no step of {GAP_DB:g} dB between excited lines and noise; "
+        "give the excited harmonics"
+    )
 
 
 def _above_a_step(level_db: FloatArray) -> BoolArray:

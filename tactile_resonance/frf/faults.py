@@ -66,9 +66,7 @@ class Fault:
     spoils : bool
         The FRF cannot be trusted because of it; otherwise it is worth knowing only.
     text : str
-        For people to read; no full stop.
-    seen_in : str
-        In how many of several records; empty where there was one.
+        For people to read; no full stop. Of several records also in how many.
     """
 
     kind: FaultKind
@@ -76,12 +74,11 @@ class Fault:
     value: float
     spoils: bool
     text: str
-    seen_in: str = ""
 
     @property
     def message(self) -> str:
         """A sentence for people."""
-        return f"{self.text}{self.seen_in and ' ' + self.seen_in}."
+        return f"{self.text}."
 
 
 @dataclass(frozen=True)
@@ -95,11 +92,6 @@ class FaultReport:
     """
 
     faults: tuple[Fault, ...] = ()
-
-    @property
-    def kinds(self) -> frozenset[FaultKind]:
-        """Kinds of fault present."""
-        return frozenset(fault.kind for fault in self.faults)
 
     @property
     def suspect(self) -> bool:
@@ -168,12 +160,9 @@ def find_faults(
                 np.asarray(harmonics),
                 transient_spoils=not transient_removed,
             )
-            missing = missing_samples(channel)
-            if missing is not None:
-                faults.append(missing)
-            if channel.complete:  # else nothing more can be detected
-                found = (check(channel) for check in CHECKS)
-                faults += [fault for fault in found if fault is not None]
+            # of a channel that lacks samples nothing more can be detected
+            checks = CHECKS if channel.complete else (missing_samples,)
+            faults += filter(None, (check(channel) for check in checks))
         reports.append(faults)
     return worst_of(reports)
 
@@ -189,7 +178,8 @@ def worst_of(per_record: Iterable[list[Fault]]) -> FaultReport:
     for same in found.values():
         worst = max(same, key=lambda fault: (fault.spoils, fault.value))
         if len(records) > 1:
-            worst = replace(worst, seen_in=f"(in {len(same)} of {len(records)} records)")
+            text = f"{worst.text} (in {len(same)} of {len(records)} records)"
+            worst = replace(worst, text=text)
         merged.append(worst)
     return FaultReport(tuple(merged))
 
@@ -449,8 +439,8 @@ def clocks(x: _Channel) -> Fault | None:
     return x.fault(FaultKind.CLOCKS, ppm, bool(turned > SPOILING_TURN), text)
 
 
-CHECKS = (saturation, offset, drift, hum, lost_samples, clocks, unsettled)
-"""What is looked for in each channel that lacks no sample."""
+CHECKS = (missing_samples, saturation, offset, drift, hum, lost_samples, clocks, unsettled)
+"""What is looked for in each channel."""
 
 
 def _clipped(record: FloatArray, periods: int) -> int:

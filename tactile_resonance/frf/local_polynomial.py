@@ -12,7 +12,7 @@ all lines.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -21,41 +21,32 @@ from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.spectra import NOT_FINITE, PeriodicSpectra, Spectrum, checked_harmonics
 
 
-class LocalPolynomialPlan:
-    """Everything of the fast local polynomial method that does not depend on the samples.
+def transient_free_spectra(
+    record: Spectrum, harmonics: npt.ArrayLike, *, order: int = 2, dof: int = 6
+) -> PeriodicSpectra:
+    """Mean spectra without the transient, and their noise covariance, from two periods or more.
 
     Parameters
     ----------
+    record : Spectrum
     harmonics : (F,) int
-        Lines wanted, ascending, from 1 to below half of `samples_per_period`. Only these are
+        Lines wanted, ascending, from 1 to below half of the samples of a period. Only these are
         computed; other lines may well be excited.
-    samples_per_period : int
-        N.
-    periods : int
-        P, at least 2.
     order : int
         Order of the polynomial for the transient. 2 suits most; a mode of damping ratio 1 % at high
         signal-to-noise ratio wants 4.
     dof : int
-        Degrees of freedom of the covariance, at least.
-
-    Attributes
-    ----------
-    groups : tuple of Neighbourhood
-        Lines by pattern of neighbouring bins.
-    noise_dof : int
-        Degrees of freedom of the covariance: the neighbours are the nearest
+        Degrees of freedom of the covariance, at least: the neighbours are the nearest
         ``2 ceil((dof + order + 1) / 2)`` bins between harmonics, less ``order + 1``.
 
     Raises
     ------
     ValueError
-        Names the field, its value, and what is accepted.
+        Names the field, its value, and what is accepted; also where a sample is not finite.
 
     Examples
     --------
-    >>> plan = LocalPolynomialPlan(np.arange(4, 4001), samples_per_period=20000, periods=8)
-    >>> spectra = plan(Spectrum.of(u, y))  # u, y: (8, 20000)
+    >>> spectra = transient_free_spectra(Spectrum.of(u, y), np.arange(4, 4001))  # u, y: (8, 20000)
 
     Notes
     -----
@@ -67,83 +58,35 @@ class LocalPolynomialPlan:
     Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
     chapter 7; Pintelon, Barbe, Vandersteen & Schoukens, MSSP 25 (2011) 2683-2704.
     """
-
-    def __init__(
-        self,
-        harmonics: npt.ArrayLike,
-        samples_per_period: int,
-        periods: int,
-        order: int = 2,
-        dof: int = 6,
-    ) -> None:
-        self.harmonics: IntArray = checked_harmonics(harmonics, samples_per_period)
-        if periods < 2:
-            raise ValueError(
-                f"periods: {periods}, expected at least 2: a single period has no bins "
-                "between harmonics from which to estimate noise and transient"
-            )
-        if order < 0:
-            raise ValueError(f"order: {order}, expected at least 0")
-        if dof < 1:
-            raise ValueError(f"dof: {dof}, expected at least 1")
-        self.samples_per_period, self.periods, self.order = samples_per_period, periods, order
-        self.groups = neighbourhoods(self.harmonics, samples_per_period, periods, order, dof)
-        self.noise_dof = self.groups[0].projector.shape[0] - 1
-
-    def __call__(self, record: Spectrum) -> PeriodicSpectra:
-        """Mean spectra of records.
-
-        Parameters
-        ----------
-        record : Spectrum
-
-        Raises
-        ------
-        ValueError
-            If the shapes do not fit the plan or a sample is not finite.
-        """
-        shape = (self.periods, self.samples_per_period)
-        if record.samples.shape[-2:] != shape:
-            raise ValueError(
-                f"record: shape {record.samples.shape}, expected (..., 2, {shape[0]}, {shape[1]})"
-            )
-        return self.from_bins(record.bins)
-
-    def from_bins(self, bins: ComplexArray) -> PeriodicSpectra:
-        """The same from bins (..., 2, P N // 2 + 1), as `Spectrum.bins`."""
-        batch = bins.shape[:-2]
-        spectra = np.empty((*batch, 2, self.harmonics.size), complex)
-        covariance = np.empty((*batch, 2, 2, self.harmonics.size), complex)
-        for group in self.groups:
-            lines = group.where
-            projected = group.project(bins)  # (..., 2, 1 + dof, L)
-            spectra[..., lines] = projected[..., 0, :]
-            y, u = projected[..., 0, 1:, :], projected[..., 1, 1:, :]  # residuals
-            covariance[..., 0, 0, lines] = _sum_of_squares(y)
-            covariance[..., 1, 1, lines] = _sum_of_squares(u)
-            cross = np.sum(y * u.conj(), axis=-2)  # (..., L)
-            covariance[..., 0, 1, lines] = cross
-            covariance[..., 1, 0, lines] = cross.conj()
-        if not np.isfinite(spectra.sum()):  # the sum shows it, at half the cost of testing all
-            raise ValueError(NOT_FINITE)
-        return PeriodicSpectra(
-            harmonics=self.harmonics,
-            samples_per_period=self.samples_per_period,
-            periods=self.periods,
-            spectra=spectra,
-            covariance=covariance,
-            noise_dof=self.noise_dof,
-            method=f"fast local polynomial method, order {self.order}",
-        )
-
-
-@lru_cache(maxsize=16)
-def kept_plan(
-    harmonics: bytes, samples_per_period: int, periods: int, order: int, dof: int
-) -> LocalPolynomialPlan:
-    """Plan of one of the latest kinds, because one measurement is like the next; bytes of int64."""
-    lines = np.frombuffer(harmonics, np.int64)
-    return LocalPolynomialPlan(lines, samples_per_period, periods, order, dof)
+    samples, periods, bins = record.samples_per_period, record.periods, record.bins
+    harmonics = checked_harmonics(harmonics, samples)
+    groups = neighbourhoods(harmonics.tobytes(), samples, periods, order, dof)
+    batch = bins.shape[:-2]
+    spectra = np.empty((*batch, 2, harmonics.size), complex)
+    covariance = np.empty((*batch, 2, 2, harmonics.size), complex)
+    for group in groups:
+        lines = group.lines
+        # a real matrix times complex numbers: real and imaginary parts are columns of their own
+        columns = np.take(bins, group.bins, axis=-1).view(float)  # (..., 2, W, 2 L)
+        projected = np.matmul(group.projector, columns).view(complex)  # (..., 2, 1 + dof, L)
+        spectra[..., lines] = projected[..., 0, :]
+        y, u = projected[..., 0, 1:, :], projected[..., 1, 1:, :]  # residuals
+        covariance[..., 0, 0, lines] = _sum_of_squares(y)
+        covariance[..., 1, 1, lines] = _sum_of_squares(u)
+        cross = np.sum(y * u.conj(), axis=-2)  # (..., L)
+        covariance[..., 0, 1, lines] = cross
+        covariance[..., 1, 0, lines] = cross.conj()
+    if not np.isfinite(spectra.sum()):  # the sum shows it, at half the cost of testing all
+        raise ValueError(NOT_FINITE)
+    return PeriodicSpectra(
+        harmonics=harmonics,
+        samples_per_period=samples,
+        periods=periods,
+        spectra=spectra,
+        covariance=covariance,
+        noise_dof=groups[0].projector.shape[0] - 1,
+        method=f"fast local polynomial method, order {order}",
+    )
 
 
 def _sum_of_squares(residual: ComplexArray) -> FloatArray:
@@ -159,8 +102,8 @@ class Neighbourhood:
 
     Attributes
     ----------
-    lines : (L,) int
-        Indices of these lines among the plan's harmonics, ascending.
+    lines : slice or (L,) int
+        Which of the harmonics these are, ascending; a slice where they are contiguous: that writes faster.
     bins : (W, L) int
         The line itself, then its neighbours, in the spectrum of the whole record.
     projector : (1 + dof, W) float
@@ -168,45 +111,39 @@ class Neighbourhood:
         whose sum of products is the covariance of that.
     """
 
-    lines: IntArray
+    lines: slice | IntArray
     bins: IntArray
     projector: FloatArray
 
-    @cached_property
-    def where(self) -> slice | IntArray:
-        """`lines` as an index, a slice where they are contiguous: that writes faster."""
-        first, last = int(self.lines[0]), int(self.lines[-1])
-        return slice(first, last + 1) if last - first + 1 == self.lines.size else self.lines
 
-    def project(self, bins: ComplexArray) -> ComplexArray:
-        """(..., 1 + dof, L) lines and residuals, from bins (..., K)."""
-        # a real matrix times complex numbers: real and imaginary parts are columns of their own
-        columns = np.take(bins, self.bins, axis=-1).view(float)  # (..., W, 2 L)
-        return np.matmul(self.projector, columns).view(complex)
-
-
+@lru_cache(maxsize=16)
 def neighbourhoods(
-    harmonics: IntArray, samples_per_period: int, periods: int, order: int, dof: int
+    harmonics: bytes, samples_per_period: int, periods: int, order: int, dof: int
 ) -> tuple[Neighbourhood, ...]:
     """Group lines by their neighbouring bins.
 
     Neighbours are the nearest bins that are no harmonic. Harmonics that are not excited do not
     count: they carry the periodic part of nonlinear distortion, which is not noise. Zero frequency,
     the Nyquist bin and whatever lies beyond do not count either (beyond, the spectrum only repeats
-    itself), so lines at the ends of the spectrum have more neighbours on one side.
+    itself), so lines at the ends of the spectrum have more neighbours on one side. Those of the latest
+    kinds of records are kept, because one measurement is like the next.
 
     Parameters
     ----------
-    harmonics : (F,) int
-        Excited lines, ascending.
+    harmonics : bytes
+        Of int64, ascending: the lines wanted.
     samples_per_period, periods, order, dof : int
-        See `LocalPolynomialPlan`.
+        See `transient_free_spectra`.
 
     Raises
     ------
     ValueError
-        If the record has too few bins between harmonics.
+        If there are too few bins between harmonics for `order` and `dof`; a single period has none.
     """
+    if order < 0:
+        raise ValueError(f"order: {order}, expected at least 0")
+    if dof < 1:
+        raise ValueError(f"dof: {dof}, expected at least 1")
     count = 2 * -(-(dof + order + 1) // 2)  # as many on either side
     last = (periods * samples_per_period - 1) // 2  # below the Nyquist bin
     available = last - last // periods
@@ -219,7 +156,7 @@ def neighbourhoods(
     offsets = np.arange(-2 * count, 2 * count + 1)
     offsets = offsets[offsets % periods != 0]
     offsets = offsets[np.argsort(np.abs(offsets), kind="stable")]
-    centre = harmonics * periods
+    centre = np.frombuffer(harmonics, np.int64) * periods
     there = (centre[:, None] + offsets >= 1) & (centre[:, None] + offsets <= last)
     nearest = there & (np.cumsum(there, axis=1) <= count)  # (F, offsets)
     lines_of: dict[bytes, list[int]] = {}
@@ -229,7 +166,9 @@ def neighbourhoods(
     for lines in map(np.array, lines_of.values()):
         neighbours = np.sort(offsets[nearest[lines[0]]])
         bins = centre[lines] + np.concatenate([[0], neighbours])[:, None]
-        groups.append(Neighbourhood(lines, bins, extrapolation_projector(neighbours, order)))
+        first, stop = int(lines[0]), int(lines[-1]) + 1
+        where = slice(first, stop) if stop - first == lines.size else lines
+        groups.append(Neighbourhood(where, bins, extrapolation_projector(neighbours, order)))
     return tuple(groups)
 
 

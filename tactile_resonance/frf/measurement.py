@@ -12,10 +12,10 @@ import numpy as np
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.force_spread import joined_spread
 from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
-from tactile_resonance.frf.distortion import DETECTING, band_lines, distortion_in_band
+from tactile_resonance.frf.distortion import DETECTING, distortion_in_band
 from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
-from tactile_resonance.frf.faults import Fault, FaultKind, FaultReport, find_faults
-from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus
+from tactile_resonance.frf.faults import FaultReport, find_faults, worst_of
+from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.skew import correct_skew
 from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, stacked_spectra
 from tactile_resonance.multisine import Excitation
@@ -62,14 +62,18 @@ class MeasurementFrf:
         if bins_band_hz is not None:
             self._bins_bands_hz = (bins_band_hz,)
         self._bands: tuple[PoleBand, ...] = ()
-        self._lines: IntArray | None = None
+        self._played: Excitation | None = None  # the first: all realisations excite the same lines
+        self._lines: IntArray = np.empty(0, np.int64)
+        self._lines_of_bands: list[IntArray] = []  # where others between them show distortion
         self._samples: FloatArray = np.empty((2, 0, 0))  # (2, room, N), rows [y; u]
-        self._spectra: dict[int, tuple[PeriodicSpectra, list[BandBins | None]]] = {}
-        self._detection: dict[int, list[PeriodicSpectra]] = {}  # of each band that has such lines
+        # of each realisation; bins and lines that show distortion in each band
+        self._spectra: dict[
+            int, tuple[PeriodicSpectra, list[BandBins], list[PeriodicSpectra]]
+        ] = {}
         self._periods: dict[int, int] = {}
         self._frf: FRF | None = None
         self._notes: list[str] = []
-        self._faults: dict[tuple[FaultKind, str], Fault] = {}
+        self._faults = FaultReport()  # the worst of each kind that a single block shows
         self._first: Record | None = None
         self._last: Record | None = None
         self._contacts: list[tuple[Contact, float]] = []  # of each block, with its length [s]
@@ -86,8 +90,8 @@ class MeasurementFrf:
         Raises
         ------
         ValueError
-            If the record does not fit the excitation, the band holds no line of it, or too many bins
-            would go with the FRF.
+            If the record does not fit the excitation, or this the first one, the band holds no line of it, or
+            too many bins would go with the FRF.
         """
         n = excitation.samples_per_period
         u, y = record.actuator.volts(), record.sensor.volts()
@@ -102,15 +106,34 @@ class MeasurementFrf:
             self._remember(record)
             self._note("nothing was played")
             return self.frf()
-        if self._lines is None:
+        if self._played is None:
             self._bands = excitation.bands
             if self._bands:
                 self._bins_bands_hz = tuple(band.ends_hz for band in self._bands)
             self._lines = self._lines_of(excitation)
+            self._lines_of_bands = [
+                _lines_in(excitation, band.ends_hz, "bands")
+                for band in (self._bands if excitation.grid in DETECTING else ())
+            ]
             self._samples = np.empty((2, excitation.periods, n))
+            self._played = excitation
+        played = self._played
+        if excitation.sample_rate_hz != played.sample_rate_hz or not np.array_equal(
+            excitation.harmonics, played.harmonics
+        ):
+            raise ValueError(
+                f"realisation: {record.realisation + 1} was played at another rate or on other lines than "
+                "the first record, expected the same"
+            )
         self._remember(record)
         block = Spectrum.of(u.reshape(-1, n), y.reshape(-1, n))
-        self._check(block, excitation)
+        found = find_faults(
+            block,
+            sample_rate_hz=excitation.sample_rate_hz,
+            harmonics=excitation.harmonics,
+            transient_removed=True,
+        )
+        self._faults = worst_of([[*self._faults.faults, *found.faults]])
         so_far = self._periods.setdefault(record.realisation, 0)
         if record.block_index * (u.size // n) != so_far:
             self._note(
@@ -118,7 +141,7 @@ class MeasurementFrf:
                 "not used from there on"
             )
         else:
-            self._take(block, record.realisation, self._lines, excitation)
+            self._take(block, record.realisation, played)
         return self.frf()
 
     def frf(self) -> FRF:
@@ -134,7 +157,7 @@ class MeasurementFrf:
         delay_s = float("nan") if self._last is None else self._last.channel_delay_s
         if frf.g.size and np.isfinite(delay_s) and delay_s != 0:
             frf = correct_skew(replace(frf, bins=None, further_bins=()), delay_s)
-        frf = FaultReport(tuple(self._faults.values())).marked(frf)
+        frf = self._faults.marked(frf)
         return frf.suspected("; ".join(self._notes)) if self._notes else frf
 
     def origin(self) -> Origin:
@@ -161,7 +184,6 @@ class MeasurementFrf:
 
     def _lines_of(self, excitation: Excitation) -> IntArray:
         """Excited harmonics in the band."""
-        frequency_hz = excitation.frequency_hz
         line_hz = excitation.sample_rate_hz / excitation.samples_per_period
         for low_hz, high_hz in self._bins_bands_hz:
             top_hz = min(high_hz, excitation.sample_rate_hz / 2)
@@ -174,18 +196,9 @@ class MeasurementFrf:
                 )
         if self._band_hz is None:
             return excitation.harmonics
-        low_hz, high_hz = self._band_hz
-        lines = excitation.harmonics[(frequency_hz >= low_hz) & (frequency_hz <= high_hz)]
-        if lines.size == 0:
-            raise ValueError(
-                f"band_hz: {low_hz:g}..{high_hz:g} holds no excited line, they reach "
-                f"from {frequency_hz[0]:g} to {frequency_hz[-1]:g} Hz"
-            )
-        return lines
+        return _lines_in(excitation, self._band_hz, "band_hz")
 
-    def _take(
-        self, record: Spectrum, realisation: int, lines: IntArray, excitation: Excitation
-    ) -> None:
+    def _take(self, record: Spectrum, realisation: int, excitation: Excitation) -> None:
         """Periods (P, N) that follow those of the same realisation without a gap."""
         if not np.all(np.isfinite(record.samples)):
             raise ValueError("record: samples are not finite, expected a complete block")
@@ -199,73 +212,46 @@ class MeasurementFrf:
         self._samples[:, so_far:periods] = record.samples
         if so_far:
             record = Spectrum(self._samples[:, :periods])
-        spectra = mean_spectra(record, lines, order=self._order, dof=self._dof)
-        bins = [
-            band_bins(
-                record,
-                excitation.harmonics,
-                sample_rate_hz=excitation.sample_rate_hz,
-                band_hz=band_hz,
-            )
+        spectra = mean_spectra(record, self._lines, order=self._order, dof=self._dof)
+        rate_hz, harmonics = excitation.sample_rate_hz, excitation.harmonics
+        found = [
+            band_bins(record, harmonics, sample_rate_hz=rate_hz, band_hz=band_hz)
             for band_hz in self._bins_bands_hz
         ]
-        self._spectra[realisation] = spectra, bins
-        if self._bands and excitation.grid in DETECTING:
-            # the first period is left out: what a polynomial leaves of the transient hides distortion
-            self._detection[realisation] = [
-                mean_spectra(record, band_lines(excitation, band.ends_hz), method="average")
-                for band in self._bands
-            ]
+        bins = [of for of in found if of is not None]
+        if len(bins) < len(found):
+            bins = []
+        # the first period is left out: what a polynomial leaves of the transient hides distortion
+        detection = [
+            mean_spectra(record, np.arange(lines[0], lines[-1] + 1), method="average")
+            for lines in self._lines_of_bands
+        ]
+        self._spectra[realisation] = spectra, bins, detection
         self._periods[realisation] = periods
         if periods < max(self._periods.values()):
             return  # it counts once it is as long as the others
-        for number in self._spectra.keys() - self._whole:
+        # with one that lost blocks all others would count as equally short
+        whole = [number for number in self._spectra if self._periods[number] == periods]
+        for number in self._spectra.keys() - whole:
             self._note(f"realisation {number + 1}: left out, shorter than the others")
-        each, bins_of_each = zip(*(self._spectra[number] for number in self._whole), strict=True)
-        frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=excitation.sample_rate_hz)
-        stacked = [stacked_bins(of) for of in zip(*bins_of_each, strict=True)]
-        known = [of for of in stacked if of is not None and of.u.size <= MOST_BINS]
-        if not known or len(known) < len(stacked):
-            known = []
+        each, bins_of_each, detection_of_each = zip(
+            *(self._spectra[number] for number in whole), strict=True
+        )
+        frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=rate_hz)
+        stacked = tuple(stacked_bins(of) for of in zip(*bins_of_each, strict=True))
+        if any(of.u.size > MOST_BINS for of in stacked):
+            stacked = ()
+        of_bands = zip(*detection_of_each, strict=True)
+        in_bands = zip(self._bands, self._lines_of_bands, of_bands, strict=False)
         self._frf = replace(
             frf,
-            bins=known[0] if known else None,
-            further_bins=tuple(known[1:]),
-            distortion=self._distortion(excitation),
+            bins=stacked[0] if stacked else None,
+            further_bins=stacked[1:],
+            distortion=tuple(
+                distortion_in_band(stacked_spectra(of), lines, band.ends_hz, sample_rate_hz=rate_hz)
+                for band, lines, of in in_bands
+            ),
         )
-
-    @property
-    def _whole(self) -> list[int]:
-        """Realisations that count: with one that lost blocks all others would count as equally short."""
-        longest = max(self._periods.values())
-        return [number for number in self._spectra if self._periods[number] == longest]
-
-    def _distortion(self, excitation: Excitation) -> tuple[BandDistortion, ...]:
-        """In each band, from all realisations that count."""
-        realisations = [self._detection[number] for number in self._whole if number in self._detection]
-        return tuple(
-            distortion_in_band(
-                stacked_spectra([of[k] for of in realisations]),
-                excitation.harmonics,
-                band.ends_hz,
-                sample_rate_hz=excitation.sample_rate_hz,
-            )
-            for k, band in enumerate(self._bands if realisations else ())
-        )
-
-    def _check(self, block: Spectrum, excitation: Excitation) -> None:
-        """Keep the worst fault of each kind that a single block shows."""
-        report = find_faults(
-            block,
-            sample_rate_hz=excitation.sample_rate_hz,
-            harmonics=excitation.harmonics,
-            transient_removed=True,
-        )
-        for fault in report.faults:
-            key = fault.kind, fault.channel
-            known = self._faults.get(key)
-            if known is None or fault.value > known.value:
-                self._faults[key] = fault
 
     def _remember(self, record: Record) -> None:
         if self._first is None:
@@ -280,6 +266,18 @@ class MeasurementFrf:
     def _note(self, text: str) -> None:
         if text not in self._notes:
             self._notes.append(text)
+
+
+def _lines_in(excitation: Excitation, band_hz: tuple[float, float], field: str) -> IntArray:
+    """Excited harmonics in a band."""
+    f, (low_hz, high_hz) = excitation.frequency_hz, band_hz
+    lines = excitation.harmonics[(f >= low_hz) & (f <= high_hz)]
+    if lines.size == 0:
+        raise ValueError(
+            f"{field}: {low_hz:g}..{high_hz:g} holds no excited line, they reach "
+            f"from {f[0]:g} to {f[-1]:g} Hz"
+        )
+    return lines
 
 
 def mean_force(blocks: Sequence[tuple[float, float, float]]) -> tuple[float, float]:

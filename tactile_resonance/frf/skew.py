@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray
-from tactile_resonance.frf.estimate import fast_frf
+from tactile_resonance.frf.estimate import frf_of_realisations
 from tactile_resonance.frf.faults import Fault, FaultKind
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra, stacked_spectra
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,8 @@ def skew_from_loopback(
     ValueError
         For fewer than three lines, or channels that do not see the same signal.
     """
-    frf = fast_frf(averaged_spectra(Spectrum.of(u, y), harmonics), sample_rate_hz=sample_rate_hz)
+    spectra = stacked_spectra([averaged_spectra(Spectrum.of(u, y), harmonics)])
+    frf = frf_of_realisations(spectra, sample_rate_hz=sample_rate_hz)
     f = frf.frequency_hz
     if f.size < 3:
         raise ValueError(f"harmonics: {f.size} lines, expected at least 3 to fit a delay")

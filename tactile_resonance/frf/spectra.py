@@ -112,21 +112,8 @@ class PeriodicSpectra:
         return np.asarray(self.harmonics * (sample_rate_hz / self.samples_per_period), float)
 
     def at(self, harmonics: npt.ArrayLike) -> PeriodicSpectra:
-        """Some of the lines.
-
-        Raises
-        ------
-        ValueError
-            If one of them is not there.
-        """
-        wanted = np.asarray(harmonics)
-        missing = np.setdiff1d(wanted, self.harmonics)
-        if missing.size:
-            raise ValueError(
-                f"harmonics: {missing[:5].tolist()} are not among the {self.harmonics.size} lines "
-                "of these spectra"
-            )
-        where = np.searchsorted(self.harmonics, wanted)
+        """Some of the lines; all of them must be there."""
+        where = np.searchsorted(self.harmonics, harmonics)
         return replace(
             self,
             harmonics=self.harmonics[where],
@@ -203,30 +190,12 @@ def averaged_spectra(
 
 
 def stacked_spectra(realisations: Sequence[PeriodicSpectra]) -> PeriodicSpectra:
-    """Spectra (..., M, 2, F) of M realisations from those of each, (..., 2, F).
-
-    The number of periods may differ; `periods` and `noise_dof` are then those of the shortest, and
-    without a covariance of each there is none.
-
-    Raises
-    ------
-    ValueError
-        If lines or period lengths differ.
-    """
-    first = realisations[0]
-    for other in realisations[1:]:
-        if other.samples_per_period != first.samples_per_period or not np.array_equal(
-            other.harmonics, first.harmonics
-        ):
-            raise ValueError("realisations: lines or period lengths differ, expected the same")
+    """Spectra (..., M, 2, F) of M realisations of as many periods, from those of each, (..., 2, F)."""
     covariances = [each.covariance for each in realisations if each.covariance is not None]
-    complete = len(covariances) == len(realisations)
     return replace(
-        first,
-        periods=min(each.periods for each in realisations),
+        realisations[0],
         spectra=np.stack([each.spectra for each in realisations], axis=-3),
-        covariance=np.stack(covariances, axis=-4) if complete else None,
-        noise_dof=min(each.noise_dof for each in realisations) if complete else 0,
+        covariance=np.stack(covariances, axis=-4) if covariances else None,
     )
 
 
@@ -249,25 +218,6 @@ def error_variance(g: ComplexArray, covariance: ComplexArray) -> FloatArray:
         + power(g) * covariance[..., 1, 1, :].real
         - 2 * (cross.real * g.real + cross.imag * g.imag)
     )
-
-
-def ratio_variance(mean: ComplexArray, covariance: ComplexArray) -> FloatArray:
-    """Variance of Y/U, to first order in the noise.
-
-    Parameters
-    ----------
-    mean : (..., 2, F) complex
-        [Y; U].
-    covariance : (..., 2, 2, F) complex
-
-    Returns
-    -------
-    (..., F) float
-        ``|Y/U|^2 (C_YY/|Y|^2 + C_UU/|U|^2 - 2 Re(C_YU / (Y conj U)))``, written without dividing by
-        Y (Pintelon & Schoukens 2012, chapter 2); NaN where there is no input.
-    """
-    input_power = power(mean[..., 1, :])
-    return error_variance(ratio(mean), covariance) / np.where(input_power == 0, np.nan, input_power)
 
 
 def conditional_variance(covariance: ComplexArray) -> FloatArray:

@@ -17,9 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance._typing import ComplexArray, FloatArray
+from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
 from tactile_resonance.frf.distortion import decibel
+
+PAPER_AXES = ("preparation", "position", "repetition", "period")
+"""Sources of figure 9 of arXiv 1805.00682, outermost first: each against the mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +49,14 @@ class NestedLevel:
     holds: FloatArray
     holds_noise: FloatArray
 
+    @property
+    def variance(self) -> FloatArray | None:
+        """(...) sample variance of the means of the members about that of their group.
+
+        It *holds* what is left of the inner scatter. None without degrees of freedom.
+        """
+        return np.sum(np.abs(self.deviations) ** 2, axis=0) / self.dof if self.dof else None
+
 
 @dataclass(frozen=True, eq=False)
 class NestedMeans:
@@ -68,6 +79,17 @@ class NestedMeans:
     mean_holds: FloatArray
     weight: FloatArray
 
+    def rms_level_db(self, level: NestedLevel, inside: BoolArray) -> float:
+        """Mean variance of a level over lines against mean ``|mean G|^2`` [dB]; NaN where unknown.
+
+        It is not ruled by the lines where G is small, as a mean of ratios would be. Both are averaged over the
+        lines inside, the latter over the outermost groups too.
+        """
+        if level.variance is None:
+            return float("nan")
+        power = np.mean(np.abs(self.mean) ** 2, axis=0)
+        return float(decibel(np.mean(level.variance[inside]) / np.mean(power[inside])))
+
 
 def nested_means(values: npt.ArrayLike, groups: npt.ArrayLike, names: Sequence[str]) -> NestedMeans:
     """Scatter at each of several nested levels.
@@ -75,10 +97,11 @@ def nested_means(values: npt.ArrayLike, groups: npt.ArrayLike, names: Sequence[s
     Parameters
     ----------
     values : (n, ...) array
-        A row for each measurement, real or complex.
+        A row for each measurement, real or complex, e.g. FRFs of single periods.
     groups : (n, L) int
         Labels of the groups, outermost first. Column i holds the groups of level i; its members are the groups
         of column i + 1, those of the last level the rows. Equal labels under different parents are different.
+        Different outermost groups, such as tissues, are not compared.
     names : sequence of str
         L of them, of the levels: what varies within the groups of that column.
 
@@ -86,6 +109,13 @@ def nested_means(values: npt.ArrayLike, groups: npt.ArrayLike, names: Sequence[s
     ------
     ValueError
         If shapes do not fit, or a value is missing (not finite).
+
+    Notes
+    -----
+    With independent sources of variances v_1 (outermost) ... v_n and, in balanced data, A_i members in
+    each group the expected sample variance of level i is
+    ``v_i + v_(i+1)/A_(i+1) + ... + v_n/(A_(i+1) ... A_n)``: averaging an inner source reduces it, but
+    does not remove it. Nothing is subtracted from `NestedLevel.variance`.
     """
     x, labels = np.asarray(values), np.asarray(groups)
     good = x.ndim >= 1 and labels.shape == (len(x), len(names)) and len(x) > 0
@@ -124,128 +154,3 @@ def nested_means(values: npt.ArrayLike, groups: npt.ArrayLike, names: Sequence[s
         weight = weight / size[ids[i]]
         x, node = mean, ids[i]
     return NestedMeans(tuple(levels), x, held, weight)
-
-
-PAPER_AXES = ("preparation", "position", "repetition", "period")
-"""Sources of figure 9 of arXiv 1805.00682, outermost first."""
-
-
-@dataclass(frozen=True, eq=False)
-class VarianceSource:
-    """Scatter over one axis.
-
-    Attributes
-    ----------
-    name : str
-    dof : int
-        Degrees of freedom: members less groups.
-    variance : (F,) float or None
-        Sample variance of the means of the members about that of their group. It *holds* what is
-        left of the inner scatter. None without degrees of freedom.
-    mean_power : (F,) float
-        ``|G|^2`` of the mean over everything, averaged over the outermost groups.
-    """
-
-    name: str
-    dof: int
-    variance: FloatArray | None
-    mean_power: FloatArray
-
-    @property
-    def rms_level_db(self) -> float:
-        """Mean variance over lines against mean ``|mean G|^2`` [dB]; NaN where unknown.
-
-        It is not ruled by the lines where G is small, as a mean of ratios would be.
-        """
-        if self.variance is None:
-            return float("nan")
-        return float(decibel(np.mean(self.variance) / np.mean(self.mean_power)))
-
-
-@dataclass(frozen=True, eq=False)
-class VarianceAnalysis:
-    """Scatter per source.
-
-    Attributes
-    ----------
-    frequency_hz : (F,) float
-    mean : (G, F) complex
-        Mean FRF of each outermost group.
-    sources : tuple of VarianceSource
-        Outermost first, as the levels were given.
-    """
-
-    frequency_hz: FloatArray
-    mean: ComplexArray
-    sources: tuple[VarianceSource, ...]
-
-    def source(self, name: str) -> VarianceSource:
-        """One source by name.
-
-        Raises
-        ------
-        ValueError
-            If there is none of that name.
-        """
-        for source in self.sources:
-            if source.name == name:
-                return source
-        known = ", ".join(source.name for source in self.sources)
-        raise ValueError(f"name: {name!r}, accepted are {known}")
-
-
-def analyse_variance(
-    g: npt.ArrayLike,
-    frequency_hz: npt.ArrayLike,
-    groups: npt.ArrayLike,
-    names: Sequence[str] = PAPER_AXES,
-) -> VarianceAnalysis:
-    """Sample variance of FRFs over each of several nested levels.
-
-    Parameters
-    ----------
-    g : (n, F) complex
-        FRFs, e.g. of single periods.
-    frequency_hz : (F,) float
-    groups : (n, L) int
-        Labels of the groups, outermost first, as `nested_means` takes them: for the paper's figure
-        those of everything, preparation, position and repetition. Different outermost groups, such as
-        tissues, are not compared.
-    names : sequence of str
-        What varies within the groups of each column.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, or an FRF is missing (not finite).
-
-    Notes
-    -----
-    With independent sources of variances v_1 (outermost) ... v_n and, in balanced data, A_i members in
-    each group the expected sample variance of level i is
-    ``v_i + v_(i+1)/A_(i+1) + ... + v_n/(A_(i+1) ... A_n)``: averaging an inner source reduces it, but
-    does not remove it. Nothing is subtracted from `variance`.
-
-    References
-    ----------
-    Figure 9 of arXiv 1805.00682 (variance over periods, repetitions, positions and preparations,
-    each against the mean); Searle, Casella & McCulloch, *Variance Components* (1992), nested
-    classification.
-    """
-    g = np.asarray(g, complex)
-    frequency = np.asarray(frequency_hz, float)
-    good = g.ndim == 2 and g.shape[1:] == frequency.shape
-    require(good, "g", g.shape, f"(n, {frequency.size}): an FRF in each row")
-    require(bool(np.all(np.isfinite(g))), "g", "some that are not finite", "complete FRFs")
-    found = nested_means(g, groups, names)
-    power = np.mean(np.abs(found.mean) ** 2, axis=0)
-    sources = tuple(
-        VarianceSource(
-            level.name,
-            level.dof,
-            np.sum(np.abs(level.deviations) ** 2, axis=0) / level.dof if level.dof else None,
-            power,
-        )
-        for level in found.levels
-    )
-    return VarianceAnalysis(frequency, found.mean, sources)

@@ -22,14 +22,10 @@ from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.nodes.excitation_design import NO_RECORDS
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import each_to_message
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.recording.messages import (
-    GRIDS,
-    each_from_message,
-    time_from_message,
-    write_each,
-)
+from tactile_resonance.recording.messages import GRIDS, each_from_message, time_from_message
 from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed, ScanEnded
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.point_file import offered_qos
@@ -98,8 +94,8 @@ class MeasureClient:
             realisations=1,
             seed=seed,
             sweep=design.sweep,
+            bands=each_to_message(msg.Band, design.bands),
         )
-        write_each(goal.bands, msg.Band, design.bands)
         with self.recorder.recording(recording, goal.measurement_id):
             return self._follow(goal, enough, check, poll, held)
 

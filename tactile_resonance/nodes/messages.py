@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Between objects of the core and messages: the only place that converts them in nodes.
 
-Beside it `recording.messages`, which needs no ROS, has what is recorded, and `nodes.scan_actions` what only
+Beside it `recording.messages`, which needs no ROS, reads what is recorded, and `nodes.scan_actions` what only
 scan_node takes and sends: the others do not load scans.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -23,12 +23,22 @@ from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus
+from tactile_resonance.frf.result import FRF, PER_LINE, BandDistortion, FrfStatus
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.messages import (
+    BETWEEN_SAMPLES,
+    EXCITATION,
+    GRIDS,
+    INPUT_KINDS,
+    ORIGIN,
+    POLES,
+    POLES_COVARIANCES,
+    POLES_DRIFTS,
+    POLES_STATUS,
+    RECORD,
     SPREAD,
     array_of,
     complex_of,
@@ -38,12 +48,9 @@ from tactile_resonance.recording.messages import (
     key_of,
     optional,
     origin_from_message,
-    write_each,
-    write_excitation,
-    write_origin,
-    write_poles,
-    write_pose,
-    write_record,
+    plain,
+    write_header,
+    write_values,
 )
 from tactile_resonance.srv import ForceOver
 
@@ -56,11 +63,8 @@ if TYPE_CHECKING:  # nodes without contact control do not load it
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}
 
 # Fields of equal name in message and object.
-FRF_EQUAL = ("noise_dof", "total_dof", "periods", "realisations", "method", "message")
-FRF_OPTIONAL = (
-    *("variance_noise", "variance_total"),
-    *("actuator_amplitude", "sensor_variance_given_actuator"),
-)
+FRF_EQUAL = plain(FRF)
+FRF_OPTIONAL = tuple(name for name in PER_LINE if name not in ("frequency_hz", "g"))
 
 UNKNOWN_SPREAD = ForceSpread()
 CONTACT_FIGURES = (
@@ -68,6 +72,7 @@ CONTACT_FIGURES = (
     *("contact_s", "total_s", "peak_force_n"),
 )
 
+M = TypeVar("M")
 RosTime = Callable[[int], int]
 """From a time of the loop's clock [ns] to ROS time [ns]."""
 
@@ -79,23 +84,59 @@ HOLDS = {
 
 def excitation_to_message(excitation: Excitation, time_ns: int, frame_id: str) -> msg.Excitation:
     """Message of an excitation designed at `time_ns`."""
-    message = msg.Excitation()
-    write_excitation(message, msg.Band, excitation, time_ns, frame_id)
-    return message
+    message = msg.Excitation(grid=GRIDS[excitation.grid], bands=each_to_message(msg.Band, excitation.bands))
+    write_header(message.header, time_ns, frame_id)
+    return write_values(message, (*EXCITATION, "level_v"), excitation)
+
+
+def each_to_message(make: type[M], objects: Sequence[PoleBand | BandDistortion]) -> list[M]:
+    """Messages of objects of numbers and texts, such as the bands in which poles are wanted."""
+    return [write_values(make(), plain(type(each)), each) for each in objects]
 
 
 def record_to_message(record: Record) -> msg.Record:
     """Message of a record."""
-    message = msg.Record()
-    write_record(message, record)
-    return message
+    message = msg.Record(
+        input_kind=INPUT_KINDS[record.input_kind],
+        between_samples=BETWEEN_SAMPLES[record.between_samples],
+    )
+    write_values(message, RECORD, record)
+    for name, channel in (("actuator", record.actuator), ("sensor", record.sensor)):
+        setattr(message, f"{name}_saturated", channel.saturated)
+        if channel.is_counts:
+            fill(getattr(message, f"{name}_counts"), channel.samples)
+            write_values(message, ("scale_v", "offset_v"), channel, f"{name}_")
+        else:
+            fill(getattr(message, f"{name}_v"), channel.samples)
+    _write_origin(message, record.origin)
+    return write_values(message, ("coverage", "reason"), record.origin.contact, "contact_")
 
 
 def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
     """Message of poles."""
-    message = msg.Poles()
-    write_poles(message, msg.BandPoles, poles, origin)
+    further = [_write_band(msg.BandPoles(), each) for each in poles.further]
+    message = _write_band(msg.Poles(further=further), poles)
+    _write_origin(message, origin)
     return message
+
+
+def _write_band(message: Any, poles: Poles) -> Any:
+    message.order, message.numerator_order = poles.structure.order, poles.structure.numerator_order
+    message.band_low_hz, message.band_high_hz = map(float, poles.band_hz)
+    message.status = POLES_STATUS[poles.status]
+    fill_complex(message, "", poles.poles_rad_s, "_rad_s")
+    fill_complex(message, "residue_", poles.residues)
+    return write_values(message, (*POLES, *POLES_DRIFTS, *POLES_COVARIANCES, "instant_s"), poles)
+
+
+def _write_origin(message: msg.Record | msg.FRF | msg.Poles, origin: Origin) -> None:
+    """What a record, FRF or poles belong to."""
+    contact = origin.contact
+    write_header(message.header, origin.time_ns, origin.frame_id)
+    message.tip_pose = pose_to_message(contact)
+    write_values(message, ORIGIN, origin)
+    write_values(message, ("force_n", "force_std_n"), contact, "contact_")
+    write_values(message, SPREAD, contact.spread, "contact_force_")
 
 
 def time_message(time_ns: int) -> Time:
@@ -106,23 +147,27 @@ def time_message(time_ns: int) -> Time:
 def pose_to_message(contact: Contact) -> PoseStamped:
     """Tip pose; an empty frame where the position is unknown."""
     message = PoseStamped()
-    write_pose(message, contact)
+    if contact.position_m is None:
+        return message
+    write_header(message.header, contact.time_ns, contact.frame_id)
+    point, turn = message.pose.position, message.pose.orientation
+    point.x, point.y, point.z = contact.position_m
+    turn.x, turn.y, turn.z, turn.w = contact.orientation_xyzw
     return message
 
 
 def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) -> msg.FRF:
     """Message of an FRF with (F,) arrays."""
-    equal = {name: getattr(frf, name) for name in FRF_EQUAL}
-    message = msg.FRF(level_v=level_v, saturated=saturated, status=FRF_STATUS[frf.status], **equal)
-    write_origin(message, origin)
-    fill(message.frequency_hz, frf.frequency_hz)
+    message = msg.FRF(
+        level_v=level_v,
+        saturated=saturated,
+        status=FRF_STATUS[frf.status],
+        bands=each_to_message(msg.Band, frf.bands),
+        distortion=each_to_message(msg.Distortion, frf.distortion),
+    )
+    _write_origin(message, origin)
+    write_values(message, (*FRF_EQUAL, "frequency_hz", *FRF_OPTIONAL), frf)
     fill_complex(message, "", frf.g)
-    for name in FRF_OPTIONAL:
-        values = getattr(frf, name)
-        if values is not None:
-            fill(getattr(message, name), values)
-    write_each(message.bands, msg.Band, frf.bands)
-    write_each(message.distortion, msg.Distortion, frf.distortion)
     if frf.bins is not None:
         _write_bins(message, (frf.bins, *frf.further_bins))
     return message
@@ -233,13 +278,8 @@ def touch_of(
 
 def contact_result(result: ContactResult) -> MakeContact.Result:
     """What became of a contact; NaN for what is not known."""
-    message = MakeContact.Result(
-        reached=result.reached, cause=result.cause.value, message=result.message
-    )
-    for name in CONTACT_FIGURES:
-        value = getattr(result, name)
-        setattr(message, name, math.nan if value is None else float(value))
-    return message
+    message = MakeContact.Result(cause=result.cause.value)
+    return write_values(message, ("reached", "message", *CONTACT_FIGURES), result)
 
 
 def contact_feedback(
@@ -259,9 +299,7 @@ def write_force_over(
 ) -> ForceOver.Response:
     """Write the force over an interval, or why it is not known."""
     response.reason, response.force_n, response.force_std_n = reason, force_n, force_std_n
-    for name in SPREAD:
-        setattr(response, f"force_{name}", getattr(spread, name))
-    return response
+    return write_values(response, SPREAD, spread, "force_")
 
 
 def wrench_message(

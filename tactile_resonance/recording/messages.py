@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excitations, records and poles from and to messages, without ROS: each field is listed once, here.
+"""Excitations, records and poles from messages, without ROS: each field of equal name is listed once, here.
 
 A message is whatever has the fields of ``msg/Excitation.msg`` and so on: arrays may be those of rclpy
 (`array.array`) or of numpy. Those of rclpy are read as views of the message's memory (``numpy.frombuffer``)
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import array
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from enum import Enum
 from typing import Any, TypeVar
@@ -47,19 +47,22 @@ POLES_STATUS = {
 }
 
 
-def _plain(kind: type) -> tuple[str, ...]:
+def plain(kind: type) -> tuple[str, ...]:
     """Fields of a dataclass that are numbers or texts: message and object name them alike."""
     return tuple(each.name for each in fields(kind) if each.type in ("int", "float", "bool", "str"))
 
 
 ORIGIN = ("measurement_id", "excitation_id", "final", "label", "simulated")
-EXCITATION_ARRAYS = ("harmonics", "amplitude_v", "phase_rad")
-POLES = ("lines", "cost", "expected_cost", "condition_number", "method", "message")
-POLES_ARRAYS = ("f0_hz", "damping_ratio")
+EXCITATION = (*plain(Excitation), "harmonics", "amplitude_v", "phase_rad")
+POLES = (
+    *("lines", "cost", "expected_cost", "condition_number", "method", "message"),
+    *("f0_hz", "damping_ratio"),
+)
 POLES_DRIFTS = ("f0_drift_hz_per_s", "damping_drift_per_s")
 POLES_COVARIANCES = ("covariance", "total_covariance", "drift_covariance")
-EXCITATION, RECORD, SPREAD = _plain(Excitation), _plain(Record), _plain(ForceSpread)
+RECORD, SPREAD = plain(Record), plain(ForceSpread)
 E = TypeVar("E", bound=Enum)
+M = TypeVar("M")
 Plain = TypeVar("Plain", PoleBand, BandDistortion)
 
 
@@ -71,35 +74,15 @@ def excitation_from_message(message: Any) -> Excitation:
     ValueError
         If its fields contradict each other.
     """
-    arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in EXCITATION_ARRAYS}
-    arrays["harmonics"] = arrays["harmonics"].astype(np.int64)
+    values = _values(message, EXCITATION)
+    values["harmonics"] = values["harmonics"].astype(np.int64)
     grid = key_of(GRIDS, message.grid, "grid")
-    bands = each_from_message(PoleBand, message.bands)
-    return Excitation(**_values(message, EXCITATION), **arrays, grid=grid, bands=bands)
+    return Excitation(**values, grid=grid, bands=each_from_message(PoleBand, message.bands))
 
 
 def each_from_message(kind: type[Plain], messages: Iterable[Any]) -> tuple[Plain, ...]:
     """Objects of numbers and texts, such as the bands in which poles are wanted, of their messages."""
-    return tuple(kind(**_values(message, _plain(kind))) for message in messages)
-
-
-def write_each(target: list[Any], make: Callable[[], Any], sources: Sequence[Plain]) -> None:
-    """Append to a field of a message those of such objects; `make` gives messages."""
-    for source in sources:
-        target.append(make())
-        _write_values(target[-1], _plain(type(source)), source)
-
-
-def write_excitation(
-    message: Any, make: Callable[[], Any], excitation: Excitation, time_ns: int, frame_id: str
-) -> None:
-    """Fill the message of an excitation designed at `time_ns`; `make` gives messages for its bands."""
-    write_header(message.header, time_ns, frame_id)
-    _write_values(message, EXCITATION, excitation)
-    for name in EXCITATION_ARRAYS:
-        fill(getattr(message, name), getattr(excitation, name))
-    message.grid, message.level_v = GRIDS[excitation.grid], excitation.level_v
-    write_each(message.bands, make, excitation.bands)
+    return tuple(kind(**_values(message, plain(kind))) for message in messages)
 
 
 def record_from_message(message: Any) -> Record:
@@ -116,24 +99,6 @@ def record_from_message(message: Any) -> Record:
         between_samples=key_of(BETWEEN_SAMPLES, message.between_samples, "between_samples"),
         origin=origin_from_message(message),
     )
-
-
-def write_record(message: Any, record: Record) -> None:
-    """Fill the message of a record."""
-    _write_values(message, RECORD, record)
-    message.input_kind = INPUT_KINDS[record.input_kind]
-    message.between_samples = BETWEEN_SAMPLES[record.between_samples]
-    for name, channel in (("actuator", record.actuator), ("sensor", record.sensor)):
-        setattr(message, f"{name}_saturated", channel.saturated)
-        if channel.is_counts:
-            fill(getattr(message, f"{name}_counts"), channel.samples)
-            setattr(message, f"{name}_scale_v", channel.scale_v)
-            setattr(message, f"{name}_offset_v", channel.offset_v)
-        else:
-            fill(getattr(message, f"{name}_v"), channel.samples)
-    write_origin(message, record.origin)
-    message.contact_coverage = float(record.origin.contact.coverage)
-    message.contact_reason = record.origin.contact.reason
 
 
 def _channel(message: Any, name: str) -> Channel:
@@ -160,48 +125,23 @@ def poles_from_message(message: Any) -> tuple[Poles, Origin]:
 def _poles_of_band(message: Any) -> Poles:
     """Of a message of ``Poles`` those of its first band, or of ``BandPoles``."""
     poles_rad_s = complex_of(message, "", "_rad_s")
-    arrays: dict[str, Any] = {name: array_of(getattr(message, name)) for name in POLES_ARRAYS}
-    for name in (*POLES_DRIFTS, *POLES_COVARIANCES):
-        arrays[name] = optional(getattr(message, name))
+    optionals: dict[str, Any] = {name: optional(getattr(message, name)) for name in POLES_DRIFTS}
     for name in POLES_COVARIANCES:
-        if (covariance := arrays[name]) is not None:
-            arrays[name] = covariance.reshape(poles_rad_s.size, 2, 2)
+        covariance, shape = optional(getattr(message, name)), (poles_rad_s.size, 2, 2)
+        optionals[name] = None if covariance is None else covariance.reshape(shape)
     structure = ModelStructure()
     if message.order:
         structure = ModelStructure(message.order, message.numerator_order)
     return Poles(
         poles_rad_s=poles_rad_s,
         residues=complex_of(message, "residue_"),
-        **arrays,
+        **optionals,
         **_values(message, POLES),
         instant_s=None if math.isnan(message.instant_s) else message.instant_s,
         structure=structure,
         band_hz=(message.band_low_hz, message.band_high_hz),
         status=key_of(POLES_STATUS, message.status, "status"),
     )
-
-
-def write_poles(message: Any, make: Callable[[], Any], poles: Poles, origin: Origin) -> None:
-    """Fill the message of poles; `make` gives messages for those of further bands."""
-    write_origin(message, origin)
-    _write_band(message, poles)
-    for each in poles.further:
-        band = make()
-        _write_band(band, each)
-        message.further.append(band)
-
-
-def _write_band(message: Any, poles: Poles) -> None:
-    _write_values(message, POLES, poles)
-    message.order, message.numerator_order = poles.structure.order, poles.structure.numerator_order
-    message.band_low_hz, message.band_high_hz = map(float, poles.band_hz)
-    message.instant_s = math.nan if poles.instant_s is None else poles.instant_s
-    message.status = POLES_STATUS[poles.status]
-    fill_complex(message, "", poles.poles_rad_s, "_rad_s")
-    fill_complex(message, "residue_", poles.residues)
-    for name in (*POLES_ARRAYS, *POLES_DRIFTS, *POLES_COVARIANCES):
-        if (known := getattr(poles, name)) is not None:
-            fill(getattr(message, name), known)
 
 
 def origin_from_message(message: Any) -> Origin:
@@ -223,18 +163,6 @@ def origin_from_message(message: Any) -> Origin:
     )
 
 
-def write_origin(message: Any, origin: Origin) -> None:
-    """Write what a record, FRF or poles belong to."""
-    contact = origin.contact
-    write_header(message.header, origin.time_ns, origin.frame_id)
-    _write_values(message, ORIGIN, origin)
-    write_pose(message.tip_pose, contact)
-    message.contact_force_n = float(contact.force_n)
-    message.contact_force_std_n = float(contact.force_std_n)
-    for name in SPREAD:
-        setattr(message, f"contact_force_{name}", float(getattr(contact.spread, name)))
-
-
 def contact_from_message(message: Any, force_n: float, force_std_n: float) -> Contact:
     """Contact of a tip pose and a force."""
     if not message.header.frame_id:
@@ -250,16 +178,6 @@ def contact_from_message(message: Any, force_n: float, force_std_n: float) -> Co
     )
 
 
-def write_pose(message: Any, contact: Contact) -> None:
-    """Write the pose of a tip; an empty frame where its position is unknown."""
-    if contact.position_m is None:
-        return
-    write_header(message.header, contact.time_ns, contact.frame_id)
-    point, turn = message.pose.position, message.pose.orientation
-    point.x, point.y, point.z = contact.position_m
-    turn.x, turn.y, turn.z, turn.w = contact.orientation_xyzw
-
-
 def spread_from_message(message: Any, prefix: str) -> ForceSpread:
     """How a force moved, of a message whose fields begin with `prefix`."""
     return ForceSpread(*(getattr(message, prefix + name) for name in SPREAD))
@@ -267,6 +185,7 @@ def spread_from_message(message: Any, prefix: str) -> ForceSpread:
 
 PROTOCOLS = {Protocol.RELAXATION: 1, Protocol.CREEP: 2, Protocol.INDENTATION: 3}
 """Constants of ``msg/Indentation``."""
+INDENTATION = ("time_s", "force_n", "depth_m", "force_std_n", "simulated")
 
 
 def indentation_from_message(message: Any, label: str = "") -> IndentationRecord:
@@ -280,31 +199,21 @@ def indentation_from_message(message: Any, label: str = "") -> IndentationRecord
     stiffness = message.beam_stiffness_n_per_m
     return IndentationRecord(
         protocol=key_of(PROTOCOLS, message.protocol, "protocol"),
-        time_s=array_of(message.time_s),
-        force_n=array_of(message.force_n),
-        depth_m=array_of(message.depth_m),
+        **_values(message, INDENTATION),
         ball=BallTip(message.tip_radius_m, stiffness_n_per_m=stiffness or math.inf),
-        force_std_n=message.force_std_n,
         label=label,
         source=message.force_source,
-        simulated=message.simulated,
     )
 
 
 def write_indentation(message: Any, test: IndentationRecord) -> None:
     """Write a record into a message."""
     message.protocol = PROTOCOLS[test.protocol]
-    for name in ("time_s", "force_n", "depth_m"):
-        values = getattr(message, name)
-        if isinstance(values, array.array):
-            fill(values, getattr(test, name))
-        else:
-            setattr(message, name, getattr(test, name))
+    write_values(message, INDENTATION, test)
     stiffness = test.ball.stiffness_n_per_m
     message.beam_stiffness_n_per_m = stiffness if math.isfinite(stiffness) else 0.0
     message.tip_radius_m = test.ball.radius_m
-    message.force_std_n, message.force_source = test.force_std_n, test.source
-    message.simulated = test.simulated
+    message.force_source = test.source
 
 
 def time_from_message(stamp: Any) -> int:
@@ -357,11 +266,28 @@ def key_of(table: dict[E, int], value: int, name: str) -> E:
 
 
 def _values(message: Any, names: Iterable[str]) -> dict[str, Any]:
-    return {name: getattr(message, name) for name in names}
+    """Fields by name, arrays as numpy sees them."""
+    values = {name: getattr(message, name) for name in names}
+    return {
+        name: array_of(value) if isinstance(value, array.array) else value
+        for name, value in values.items()
+    }
 
 
-def _write_values(message: Any, names: Iterable[str], source: object) -> None:
-    """Write fields of equal name; numbers of numpy as those of Python, which alone rclpy takes."""
+def write_values(message: M, names: Iterable[str], source: object, prefix: str = "") -> M:
+    """Write what an object has under these names to the fields so called behind a prefix; return the message.
+
+    Numbers of numpy become those of Python, which alone rclpy takes; where the object has None, an array stays
+    empty and a number is NaN.
+    """
     for name in names:
-        value = getattr(source, name)
-        setattr(message, name, value.item() if isinstance(value, np.generic) else value)
+        value, target = getattr(source, name), getattr(message, prefix + name)
+        if isinstance(target, array.array):
+            if value is not None:
+                fill(target, value)
+        elif isinstance(target, np.ndarray):
+            setattr(message, prefix + name, value)
+        else:
+            kind = type(target)
+            setattr(message, prefix + name, kind(math.nan if value is None else value))
+    return message

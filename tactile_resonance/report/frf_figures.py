@@ -18,7 +18,7 @@ from tactile_resonance.analysis import Analysis
 from tactile_resonance.calibration.fit import Fitted
 from tactile_resonance.calibration.records import Load
 from tactile_resonance.frf.distortion import DetectionLines, Distortion, decibel
-from tactile_resonance.frf.variance_analysis import VarianceAnalysis
+from tactile_resonance.frf.variance_analysis import NestedMeans
 from tactile_resonance.report.drawing import draw_ellipse, new_figure
 
 
@@ -128,10 +128,9 @@ def draw_distortion_levels(cases: Mapping[float, Distortion], title: str) -> Fig
     for name, marker in (("even", "o-"), ("odd", "s-")):
         lines = [getattr(cases[level], name) for level in levels]
         axes.plot(levels, [float(np.max(x.rms_level_db)) for x in lines], marker, label=name)
-    noise = [cases[level].odd.rms_noise_level_db for level in levels]
-    known = [float(np.max(x)) for x in noise if x is not None]
-    if len(known) == len(levels):
-        axes.plot(levels, known, "k.--", label="noise at odd lines")
+    noise = [float(np.max(cases[level].odd.rms_noise_level_db)) for level in levels]
+    if not np.any(np.isnan(noise)):
+        axes.plot(levels, noise, "k.--", label="noise at odd lines")
     axes.set(
         xlabel="drive level [V rms]",
         ylabel="against the linear output in the band [dB]",
@@ -158,7 +157,7 @@ def _draw_case(axes: Axes, distortion: Distortion) -> None:
         if lines.harmonics.size == 0:
             continue
         _dots(axes, lines.frequency_hz, lines.power, _label(name, lines), 1.5, color=colour)
-        if lines.noise_power is not None and name == "even":
+        if name == "even" and not np.all(np.isnan(lines.noise_power)):
             _dots(axes, lines.frequency_hz, lines.noise_power, "noise", 1.5, color="0.6")
     axes.legend(fontsize="small", markerscale=4, loc="lower left")
     axes.grid(alpha=0.3)
@@ -175,19 +174,20 @@ def _label(name: str, lines: DetectionLines) -> str:
 
 
 def draw_variance(
-    analysis: VarianceAnalysis, in_band: VarianceAnalysis, band_hz: tuple[float, float], title: str
+    found: NestedMeans, frequency_hz: FloatArray, band_hz: tuple[float, float], title: str
 ) -> Figure:
     """Mean FRF and the standard deviation over each source, in dB; the legend speaks of the band."""
     figure = new_figure(10, 6)
     axes = figure.subplots()
-    power = np.mean(np.abs(analysis.mean) ** 2, axis=0)
-    axes.semilogx(analysis.frequency_hz, decibel(power), "k-", lw=1, label="mean |G|")
-    for k, source in enumerate(reversed(analysis.sources)):
+    inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    power = np.mean(np.abs(found.mean) ** 2, axis=0)
+    axes.semilogx(frequency_hz, decibel(power), "k-", lw=1, label="mean |G|")
+    for k, source in enumerate(reversed(found.levels)):
         if source.variance is None:
             continue
-        level_db = in_band.source(source.name).rms_level_db
+        level_db = found.rms_level_db(source, inside)
         label = f"over {source.name}: {level_db:.1f} dB of rms |G| in the band, {source.dof} degrees of freedom"
-        _dots(axes, analysis.frequency_hz, source.variance, label, 2, color=f"C{k}")
+        _dots(axes, frequency_hz, source.variance, label, 2, color=f"C{k}")
     axes.axvspan(*band_hz, color="0.92", zorder=0, label=f"band {band_hz[0]:g}-{band_hz[1]:g} Hz")
     axes.set(xlabel="frequency [Hz]", ylabel="[dB]", title=title)
     axes.legend(fontsize="small", markerscale=4)

@@ -173,7 +173,7 @@ def _output(recording: Recording, name: str) -> Figure:
         if lines.harmonics.size:
             at_hz = lines.frequency_hz
             traces.append(_trace(f"{parity} lines", at_hz, decibel(lines.power), colour))
-            if (noise := lines.noise_power) is not None:
+            if not np.all(np.isnan(noise := lines.noise_power)):
                 of_noise = f"noise at {parity} lines"
                 traces.append(_trace(of_noise, at_hz, decibel(noise), colour, "circle-open"))
     title, note = f"Output and its distortion, {name} (figure 5)", found.summary()

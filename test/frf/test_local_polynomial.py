@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from tactile_resonance.frf.estimate import fast_frf
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.estimate import frf_of_realisations
+from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.result import FrfStatus
-from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra, stacked_spectra
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,8 @@ def oracle(shared_data):
     ],
 )
 def test_equals_the_reference_implementation(oracle, key, harmonics, order, dof, actual_dof):
-    plan = LocalPolynomialPlan(harmonics, 20000, 8, order, dof)
-    result = plan(Spectrum.of(oracle["u"].reshape(8, 20000), oracle["y"].reshape(8, 20000)))
+    record = Spectrum.of(oracle["u"].reshape(8, 20000), oracle["y"].reshape(8, 20000))
+    result = transient_free_spectra(record, harmonics, order=order, dof=dof)
     assert np.max(np.abs(result.spectra / oracle[f"Z_{key}"] - 1)) < 1e-9
     assert np.max(np.abs(result.covariance / oracle[f"CZ_{key}"] - 1)) < 1e-7
     assert result.noise_dof == actual_dof
@@ -36,8 +36,10 @@ def test_equals_the_reference_implementation(oracle, key, harmonics, order, dof,
 def test_single_precision_records_give_what_their_double_copies_give(oracle):
     u, y = oracle["u"].reshape(8, 20000), oracle["y"].reshape(8, 20000)
     assert u.dtype == y.dtype == np.float32
-    plan = LocalPolynomialPlan(oracle["harm"], 20000, 8)
-    single, double = plan(Spectrum.of(u, y)), plan(Spectrum.of(u.astype(float), y.astype(float)))
+    single, double = (
+        transient_free_spectra(Spectrum.of(u.astype(kind), y.astype(kind)), oracle["harm"])
+        for kind in (np.float32, float)
+    )
     assert np.array_equal(single.spectra, double.spectra)
     assert np.array_equal(single.covariance, double.covariance)
 
@@ -48,15 +50,16 @@ def test_single_precision_records_give_what_their_double_copies_give(oracle):
 def test_polynomial_transient_is_removed_exactly(periods, samples, order):
     """A spectrum that is a polynomial in the bin number leaves no trace, up to the edges."""
     rng = np.random.default_rng(periods)
-    plan = LocalPolynomialPlan(np.arange(1, (samples - 1) // 2 + 1), samples, periods, order, 4)
+    harmonics = np.arange(1, (samples - 1) // 2 + 1)
     bins = np.arange(periods * samples // 2 + 1)
     coefficients = rng.standard_normal((2, order + 1)) + 1j * rng.standard_normal((2, order + 1))
     transient = np.polynomial.polynomial.polyval(bins / bins[-1], coefficients.T)  # (2, K)
-    lines = rng.standard_normal((2, plan.harmonics.size)) + 1j
+    lines = rng.standard_normal((2, harmonics.size)) + 1j
     spectrum = transient.copy()
-    spectrum[:, plan.harmonics * periods] += lines
+    spectrum[:, harmonics * periods] += lines
     record = np.fft.irfft(spectrum, periods * samples, norm="forward")  # (2, P N)
-    result = plan(Spectrum(record.reshape(2, periods, samples)))
+    record = Spectrum(record.reshape(2, periods, samples))
+    result = transient_free_spectra(record, harmonics, order=order, dof=4)
     assert np.allclose(result.spectra, lines, atol=1e-8 * np.abs(transient).max())
     assert np.max(np.abs(result.covariance)) < 1e-16 * np.abs(transient).max() ** 2
 
@@ -66,8 +69,7 @@ def test_what_stands_at_other_harmonics_does_not_matter(multisine):
     odd = np.arange(1, 200, 2)
     u = np.tile(multisine(odd, 1000, rng), (3, 1)) + 0.01 * rng.standard_normal((3, 1000))
     even = np.tile(multisine(np.arange(2, 200, 2), 1000, rng), (3, 1))
-    plan = LocalPolynomialPlan(odd, 1000, 3)
-    quiet, distorted = plan(Spectrum.of(u, u)), plan(Spectrum.of(u + even, u + even))
+    quiet, distorted = (transient_free_spectra(Spectrum.of(x, x), odd) for x in (u, u + even))
     assert np.allclose(quiet.spectra, distorted.spectra, rtol=0, atol=1e-12)
     assert np.allclose(quiet.covariance, distorted.covariance, rtol=1e-9, atol=0)
 
@@ -75,21 +77,21 @@ def test_what_stands_at_other_harmonics_does_not_matter(multisine):
 def test_lines_do_not_depend_on_which_others_are_wanted():
     rng = np.random.default_rng(2)
     u, y = rng.standard_normal((2, 4, 3, 500))  # (M, P, N) each
-    full = LocalPolynomialPlan(np.arange(1, 250), 500, 3)(Spectrum.of(u, y))
+    full = transient_free_spectra(Spectrum.of(u, y), np.arange(1, 250))
     some = np.array([1, 2, 7, 50, 51, 60, 249])
-    part = LocalPolynomialPlan(some, 500, 3)(Spectrum.of(u, y))
+    part = transient_free_spectra(Spectrum.of(u, y), some)
     assert part.spectra.shape == (4, 2, 7)
     assert part.covariance.shape == (4, 2, 2, 7)
     assert np.allclose(part.spectra, full.spectra[..., some - 1], rtol=1e-12, atol=0)
     assert np.allclose(part.covariance, full.covariance[..., some - 1], rtol=1e-10, atol=0)
-    one = LocalPolynomialPlan(some, 500, 3)(Spectrum.of(u[2], y[2]))
+    one = transient_free_spectra(Spectrum.of(u[2], y[2]), some)
     assert np.allclose(one.covariance, part.covariance[2], rtol=1e-10, atol=0)
 
 
 def test_covariance_is_hermitian_and_positive():
     rng = np.random.default_rng(3)
     u, y = rng.standard_normal((2, 2, 300))
-    c = LocalPolynomialPlan(np.arange(1, 150), 300, 2)(Spectrum.of(u, y)).covariance
+    c = transient_free_spectra(Spectrum.of(u, y), np.arange(1, 150)).covariance
     assert np.array_equal(c[0, 1], c[1, 0].conj())
     assert np.all(np.linalg.eigvalsh(np.moveaxis(c, -1, 0)) > 0)
 
@@ -113,12 +115,8 @@ def test_response_is_not_conjugated(multisine, system, method):
     f_all = np.fft.rfftfreq(samples, 1 / rate)
     y = np.fft.irfft(np.fft.rfft(u) * system(f_all, rate), samples)
     u, y = np.tile(u, (3, 1)), np.tile(y, (3, 1))
-    spectra = (
-        LocalPolynomialPlan(lines, samples, 3)(Spectrum.of(u, y))
-        if method == "fast"
-        else averaged_spectra(Spectrum.of(u, y), lines)
-    )
-    frf = fast_frf(spectra, sample_rate_hz=rate)
+    estimate = transient_free_spectra if method == "fast" else averaged_spectra
+    frf = frf_of_realisations(estimate(Spectrum.of(u[None], y[None]), lines), sample_rate_hz=rate)
     assert np.allclose(frf.frequency_hz, lines * 5.0)
     assert np.allclose(frf.g, system(frf.frequency_hz, rate), atol=1e-12)
     assert np.all(np.angle(frf.g[:20]) < 0)
@@ -128,7 +126,7 @@ def test_a_cosine_of_peak_a_gives_half_a():
     t = np.arange(400) / 100
     u = 0.6 * np.cos(2 * np.pi * 7 * t + 0.4).reshape(4, 100)
     y = 3 * np.cos(2 * np.pi * 7 * t - 0.2).reshape(4, 100)
-    spectra = LocalPolynomialPlan(np.array([7]), 100, 4)(Spectrum.of(u, y)).spectra[:, 0]
+    spectra = transient_free_spectra(Spectrum.of(u, y), [7]).spectra[:, 0]
     assert np.allclose(spectra, [1.5 * np.exp(-0.2j), 0.3 * np.exp(0.4j)], atol=1e-12)
 
 
@@ -144,12 +142,12 @@ def test_transient_of_a_resonance_from_rest(multisine):
     truth = signal.freqz(b, a, 2 * np.pi * lines / samples)[1]
 
     def error(spectra):
-        g = fast_frf(spectra, sample_rate_hz=1.0).g
+        g = frf_of_realisations(stacked_spectra([spectra]), sample_rate_hz=1.0).g
         return np.sqrt(np.mean(np.abs(g / truth - 1) ** 2))
 
     plain = error(averaged_spectra(Spectrum.of(u, y), lines))
     order = {
-        r: error(LocalPolynomialPlan(lines, samples, periods, r, 2)(Spectrum.of(u, y)))
+        r: error(transient_free_spectra(Spectrum.of(u, y), lines, order=r, dof=2))
         for r in (0, 2, 4)
     }
     assert plain > 30 * order[2]
@@ -158,17 +156,17 @@ def test_transient_of_a_resonance_from_rest(multisine):
 
 def test_weak_input_is_suspect():
     rng = np.random.default_rng(6)
-    u, y = rng.standard_normal((2, 4, 200))
-    frf = fast_frf(
-        LocalPolynomialPlan(np.arange(3, 40), 200, 4)(Spectrum.of(u, y)), sample_rate_hz=200.0
-    )
+    u, y = rng.standard_normal((2, 1, 4, 200))
+    spectra = transient_free_spectra(Spectrum.of(u, y), np.arange(3, 40))
+    frf = frf_of_realisations(spectra, sample_rate_hz=200.0)
     assert frf.status is FrfStatus.SUSPECT
     assert "10 dB above its noise" in frf.message
 
 
 def test_a_single_period_has_no_covariance(multisine):
-    u = multisine([3, 5], 100, np.random.default_rng(7))[None]
-    frf = fast_frf(averaged_spectra(Spectrum.of(u, 2 * u), [3, 5]), sample_rate_hz=100.0)
+    u = multisine([3, 5], 100, np.random.default_rng(7))[None, None]
+    spectra = averaged_spectra(Spectrum.of(u, 2 * u), [3, 5])
+    frf = frf_of_realisations(spectra, sample_rate_hz=100.0)
     assert frf.status is FrfStatus.NO_COVARIANCE
     assert frf.variance is None
     assert frf.sensor_variance_given_actuator is None
@@ -178,7 +176,7 @@ def test_a_single_period_has_no_covariance(multisine):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"periods": 1}, "periods: 1, expected at least 2"),
+        ({"periods": 1}, "a record of 1 x 50 samples has 0; lower either or record more"),
         ({"order": -1}, "order: -1"),
         ({"dof": 0}, "dof: 0"),
         ({"dof": 90}, "dof: 2, 90 need 94 bins between harmonics, .* has 50; lower either"),
@@ -189,21 +187,19 @@ def test_a_single_period_has_no_covariance(multisine):
         ({"harmonics": np.array([], int)}, "harmonics: .* F >= 1"),
     ],
 )
-def test_impossible_plans_are_refused(change, message):
-    good = {"harmonics": np.array([3, 4]), "samples_per_period": 50, "periods": 3, "dof": 2}
-    LocalPolynomialPlan(**good)
+def test_what_is_impossible_is_refused(change, message):
+    def run(periods=3, harmonics=(3, 4), **options):
+        silent = Spectrum(np.zeros((2, periods, 50)))
+        transient_free_spectra(silent, np.array(harmonics), **{"dof": 2, **options})
+
+    run()
     with pytest.raises(ValueError, match=message):
-        LocalPolynomialPlan(**{**good, **change})
+        run(**change)
 
 
 def test_bad_records_are_named():
-    plan = LocalPolynomialPlan(np.array([3, 4]), 50, 3, dof=2)
     good = np.zeros((3, 50))
-    with pytest.raises(
-        ValueError, match=r"record: shape \(2, 2, 50\), expected \(\.\.\., 2, 3, 50\)"
-    ):
-        plan(Spectrum.of(good[:2], good[:2]))
     gap = good.copy()
     gap[1, 7] = np.nan
     with pytest.raises(ValueError, match="not finite"):
-        plan(Spectrum.of(gap, good))
+        transient_free_spectra(Spectrum.of(gap, good), [3, 4], dof=2)

@@ -258,6 +258,18 @@ def test_a_record_that_does_not_fit_is_refused(channels):
         MeasurementFrf(1).add(record(u[0, 0, :-1], y[0, 0], 0, 0), excitation(0))
 
 
+def test_realisations_on_other_lines_are_refused(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1)
+    measurement.add(record(u[0, 0], y[0, 0], 0, 0), excitation(0))
+    other = excitation(1)
+    few = {name: getattr(other, name)[1:] for name in ("harmonics", "amplitude_v", "phase_rad")}
+    for changed in (replace(other, **few), replace(other, sample_rate_hz=2 * RATE_HZ)):
+        with pytest.raises(ValueError, match="realisation: 2 was played at another rate or on other"):
+            measurement.add(record(u[1, 0], y[1, 0], 1, 0), changed)
+    assert measurement.add(record(u[1, 0], y[1, 0], 1, 0), other).realisations == 2
+
+
 @pytest.mark.parametrize("periods", [(4, 4), (4, 3)])
 def test_bins_of_all_realisations_come_along_where_they_are_alike(channels, periods):
     u, y = channels

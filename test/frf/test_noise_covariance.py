@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from tactile_resonance.frf.estimate import fast_frf
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.estimate import frf_of_realisations
+from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
 
 SIGMAS = 4.0
@@ -55,7 +55,7 @@ def simulate(rng, multisine, noise, periods, transient):
 def test_local_polynomial(multisine, deviation_from_one, noise, transient, periods, order, dof):
     rng = np.random.default_rng([periods, order, transient])
     (y, u), truth = simulate(rng, multisine, noise, periods, transient)
-    result = LocalPolynomialPlan(LINES, SAMPLES, periods, order, dof)(Spectrum.of(u, y))
+    result = transient_free_spectra(Spectrum.of(u, y), LINES, order=order, dof=dof)
     error = result.spectra - truth  # (RUNS, 2, F)
     scatter = np.einsum("rif,rjf->rijf", error, error.conj())
     for i in (0, 1):
@@ -89,7 +89,8 @@ def assert_same_cross_covariance(estimated, scatter):
 def test_variance_of_the_response(multisine, deviation_from_one, noise):
     rng = np.random.default_rng(11)
     (y, u), truth = simulate(rng, multisine, noise, 4, transient=True)
-    frf = fast_frf(LocalPolynomialPlan(LINES, SAMPLES, 4)(Spectrum.of(u, y)), sample_rate_hz=1.0)
+    spectra = transient_free_spectra(Spectrum.of(u[:, None], y[:, None]), LINES)
+    frf = frf_of_realisations(spectra, sample_rate_hz=1.0)
     error = np.abs(frf.g - truth[0] / truth[1]) ** 2
     ratio, sigmas = deviation_from_one(frf.variance_noise, error)
     assert sigmas < SIGMAS, ratio
@@ -100,7 +101,7 @@ def test_degrees_of_freedom(multisine):
     rng = np.random.default_rng(12)
     (y, u), _ = simulate(rng, multisine, white, 4, transient=False)
     for dof in (2, 6, 12):
-        result = LocalPolynomialPlan(LINES, SAMPLES, 4, 2, dof)(Spectrum.of(u, y))
+        result = transient_free_spectra(Spectrum.of(u, y), LINES, dof=dof)
         power = result.covariance[:, 0, 0].real  # (RUNS, F)
         scatter = np.mean(np.var(power, axis=0, ddof=1) / np.mean(power, axis=0) ** 2)
         assert scatter * result.noise_dof == pytest.approx(1, abs=0.1)
@@ -111,7 +112,7 @@ def test_dropping_nothing_from_a_transient_is_worse(multisine):
     rng = np.random.default_rng(13)
     (y, u), truth = simulate(rng, multisine, lambda rng, s: 0.02 * white(rng, s), 3, True)
     plain = averaged_spectra(Spectrum.of(u, y), LINES)
-    fitted = LocalPolynomialPlan(LINES, SAMPLES, 3)(Spectrum.of(u, y))
+    fitted = transient_free_spectra(Spectrum.of(u, y), LINES)
     error = {
         name: np.sqrt(np.mean(np.abs(s.spectra[:, 0] - truth[0]) ** 2))
         for name, s in (("plain", plain), ("fitted", fitted))

@@ -8,8 +8,8 @@ import pytest
 from scipy import signal, stats
 
 from tactile_resonance.frf import realisations
-from tactile_resonance.frf.estimate import frf_of_record, robust_frf
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.estimate import frf_of_realisations, frf_of_record
+from tactile_resonance.frf.local_polynomial import neighbourhoods, transient_free_spectra
 from tactile_resonance.frf.realisations import Agreement, transient_lines
 from tactile_resonance.frf.result import FrfStatus
 from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
@@ -22,9 +22,9 @@ SYSTEM = ([0.5], [1.0, -0.5])
 
 def test_equals_the_reference_implementation(shared_data):
     with np.load(shared_data / "oracle" / "nl_odd_random_grid.npz") as data:
-        plan = LocalPolynomialPlan(data["ex"], 4000, 4, order=2, dof=2)
-        spectra = plan(Spectrum.of(data["u"], data["y"]))
-        result = robust_frf(spectra, sample_rate_hz=float(data["fs"]))
+        record = Spectrum.of(data["u"], data["y"])
+        spectra = transient_free_spectra(record, data["ex"], order=2, dof=2)
+        result = frf_of_realisations(spectra, sample_rate_hz=float(data["fs"]))
         for mine, theirs in (
             (result.frequency_hz, "freq"),
             (result.g, "G"),
@@ -53,8 +53,8 @@ def test_total_is_noise_plus_distortion(multisine, deviation_from_one, noise):
     rng = np.random.default_rng(1)
     runs, realisations, periods = 80, 5, 3
     y, u = cubic_records(rng, multisine, runs, realisations, periods, noise)
-    plan = LocalPolynomialPlan(LINES, SAMPLES, periods)
-    result = robust_frf(plan(Spectrum.of(u, y)), sample_rate_hz=1.0)
+    spectra = transient_free_spectra(Spectrum.of(u, y), LINES, order=2, dof=6)
+    result = frf_of_realisations(spectra, sample_rate_hz=1.0)
     # the best linear approximation, from as many realisations again without noise
     y0, u0 = cubic_records(rng, multisine, 1, 2000, 2, 0.0)
     settled = averaged_spectra(Spectrum.of(u0[0], y0[0]), LINES, unsettled_periods=1)
@@ -68,7 +68,7 @@ def test_total_is_noise_plus_distortion(multisine, deviation_from_one, noise):
     assert sigmas < SIGMAS, ratio
     # noise of the same level on a linear system of the same best linear approximation: the noise
     # variance does not see the distortion
-    white = noise**2 / (SAMPLES * periods) * (1 + _extrapolation(plan))
+    white = noise**2 / (SAMPLES * periods) * (1 + _extrapolation(periods))
     input_power = np.mean(np.abs(settled.spectra[:, 1]) ** 2, axis=0)
     expected = white * (1 + np.abs(best) ** 2) / input_power / realisations
     ratio, sigmas = deviation_from_one(
@@ -77,9 +77,10 @@ def test_total_is_noise_plus_distortion(multisine, deviation_from_one, noise):
     assert sigmas < SIGMAS, ratio
 
 
-def _extrapolation(plan):
+def _extrapolation(periods):
     """Variance that the extrapolated transient adds, relative to the line's own noise."""
-    most = max(plan.groups, key=lambda group: group.lines.size)
+    groups = neighbourhoods(LINES.tobytes(), SAMPLES, periods, 2, 6)
+    most = max(groups, key=lambda group: group.bins.shape[1])
     return float(np.sum(most.projector[0, 1:] ** 2))
 
 
@@ -88,9 +89,8 @@ def test_linear_system_has_no_distortion(multisine, deviation_from_one):
     u = np.tile(multisine(LINES, SAMPLES, rng, records=(200, 3)), 2)
     y = signal.lfilter(*SYSTEM, u, axis=-1)
     u, y = ((x + 0.05 * rng.standard_normal(x.shape)).reshape(200, 3, 2, SAMPLES) for x in (u, y))
-    result = robust_frf(
-        LocalPolynomialPlan(LINES, SAMPLES, 2)(Spectrum.of(u, y)), sample_rate_hz=1.0
-    )
+    spectra = transient_free_spectra(Spectrum.of(u, y), LINES)
+    result = frf_of_realisations(spectra, sample_rate_hz=1.0)
     ratio, sigmas = deviation_from_one(result.variance_total, result.variance_noise)
     assert sigmas < SIGMAS, ratio
 
@@ -98,7 +98,8 @@ def test_linear_system_has_no_distortion(multisine, deviation_from_one):
 def test_single_periods_tell_the_total_only(multisine):
     rng = np.random.default_rng(5)
     y, u = cubic_records(rng, multisine, 1, 4, 1, 0.01)
-    result = robust_frf(averaged_spectra(Spectrum.of(u[0], y[0]), LINES), sample_rate_hz=1.0)
+    spectra = averaged_spectra(Spectrum.of(u[0], y[0]), LINES)
+    result = frf_of_realisations(spectra, sample_rate_hz=1.0)
     assert result.variance_noise is None
     assert result.variance_distortion is None
     assert result.variance_total is not None
@@ -108,9 +109,9 @@ def test_single_periods_tell_the_total_only(multisine):
 
 def test_refusals(multisine):
     rng = np.random.default_rng(7)
-    u = multisine(LINES, SAMPLES, rng, records=(2, 2))  # (M, P, N)
-    with pytest.raises(ValueError, match="expected .* M >= 2 realisations"):
-        robust_frf(averaged_spectra(Spectrum.of(u[:1], u[:1]), LINES), sample_rate_hz=1.0)
+    u = multisine(LINES, SAMPLES, rng, records=(2,))  # (P, N)
+    with pytest.raises(ValueError, match="expected .* with realisations M"):
+        frf_of_realisations(averaged_spectra(Spectrum.of(u, u), LINES), sample_rate_hz=1.0)
 
 
 def test_single_periods_from_rest_are_told_from_settled_ones():

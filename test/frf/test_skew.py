@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from tactile_resonance.frf.estimate import fast_frf
+from tactile_resonance.frf.estimate import frf_of_realisations
 from tactile_resonance.frf.faults import FaultKind
-from tactile_resonance.frf.local_polynomial import LocalPolynomialPlan
+from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.result import PER_LINE
 from tactile_resonance.frf.skew import correct_skew, skew_from_loopback, suspected_skew
 from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
@@ -54,24 +54,29 @@ def test_delays_of_many_samples_need_no_unwrapping(multisine, delay_s):
     assert skew.delay_s == pytest.approx(delay_s, abs=6 * skew.delay_std_s)
 
 
+def settled_frf(u, y):
+    spectra = averaged_spectra(Spectrum.of(u[None], y[None]), LINES)
+    return frf_of_realisations(spectra, sample_rate_hz=RATE)
+
+
 def test_correction_restores_the_response(multisine):
     delay, response = 37e-6, 1 / (1 + 1j * F_HZ / 800)
     records = [loopback(np.random.default_rng(4), multisine, d, 1, response) for d in (0, delay)]
-    plan = LocalPolynomialPlan(LINES, SAMPLES, 3)
-    true, skewed = (fast_frf(plan(Spectrum.of(u, y)), sample_rate_hz=RATE) for u, y in records)
+    clean, delayed = (
+        transient_free_spectra(Spectrum.of(u[None], y[None]), LINES) for u, y in records
+    )
+    true, skewed = (frf_of_realisations(x, sample_rate_hz=RATE) for x in (clean, delayed))
     corrected = correct_skew(skewed, delay)
     scatter = np.sqrt(true.variance_noise)
     assert np.max(np.abs(skewed.g - true.g) / scatter) > 5
     assert np.max(np.abs(corrected.g - true.g) / scatter) < 5
     # as if the spectra had come so
-    (u, y), frequency_hz = records[1], skewed.frequency_hz
-    turn = np.stack([np.exp(2j * np.pi * frequency_hz * delay), np.ones(LINES.size)])  # [Y; U]
-    spectra = plan(Spectrum.of(u, y))
-    expected = fast_frf(
+    turn = np.stack([np.exp(2j * np.pi * skewed.frequency_hz * delay), np.ones(LINES.size)])  # [Y; U]
+    expected = frf_of_realisations(
         replace(
-            spectra,
-            spectra=spectra.spectra * turn,
-            covariance=spectra.covariance * turn[:, None] * turn.conj(),
+            delayed,
+            spectra=delayed.spectra * turn,
+            covariance=delayed.covariance * turn[:, None] * turn.conj(),
         ),
         sample_rate_hz=RATE,
     )
@@ -84,10 +89,7 @@ def test_skew_is_suspected_where_a_flat_response_has_straight_phase(multisine):
     # feed-through with a mode low in the band, as of a bimorph
     mode = 1 + 0.2 / (1 - (F_HZ / 300) ** 2 + 0.04j * F_HZ / 300)
     frf = {
-        delay: fast_frf(
-            averaged_spectra(Spectrum.of(*loopback(rng, multisine, delay, 1, mode)), LINES),
-            sample_rate_hz=RATE,
-        )
+        delay: settled_frf(*loopback(rng, multisine, delay, 1, mode))
         for delay in (0.0, 20e-6)
     }
     assert suspected_skew(frf[0.0]) is None
@@ -103,8 +105,7 @@ def test_phases_of_noise_are_no_delay(multisine):
     suspected = []
     for _ in range(50):
         u, y = loopback(rng, multisine, 0.0, 1)
-        spectra = averaged_spectra(Spectrum.of(u, rng.standard_normal(y.shape)), LINES)
-        suspected.append(suspected_skew(fast_frf(spectra, sample_rate_hz=RATE)))
+        suspected.append(suspected_skew(settled_frf(u, rng.standard_normal(y.shape))))
     assert suspected == [None] * 50
 
 
@@ -116,6 +117,6 @@ def test_refusals(multisine):
     resonance = signal.lfilter([1], [1, -1.8, 0.95], y, axis=-1)
     with pytest.raises(ValueError, match="expected a loop-back"):
         skew_from_loopback(u, resonance, sample_rate_hz=RATE, harmonics=LINES)
-    frf = fast_frf(averaged_spectra(Spectrum.of(u, y), LINES), sample_rate_hz=RATE)
+    frf = settled_frf(u, y)
     with pytest.raises(ValueError, match="delay_s: nan"):
         correct_skew(frf, float("nan"))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import ratio_variance
+from tactile_resonance.frf.spectra import error_variance, power, ratio
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
@@ -105,16 +105,16 @@ def test_lines_without_a_finite_response_are_left_out():
     assert "1 lines" in poles.message
 
 
-def test_ratio_variance_is_the_first_order_propagation():
+def test_error_variance_over_input_power_is_the_first_order_propagation():
     """Against a numerical derivative of Y/U in the direction of correlated errors."""
     mean = np.array([[1.0 + 2j], [3.0 - 1j]])
     rng = np.random.default_rng(3)
     root = 1e-6 * (rng.standard_normal((2, 2)) + 1j * rng.standard_normal((2, 2)))
     draws = rng.standard_normal((2, 200_000)) + 1j * rng.standard_normal((2, 200_000))
     errors = root @ draws / np.sqrt(2)
-    ratio = (mean[0] + errors[0]) / (mean[1] + errors[1]) - mean[0] / mean[1]
-    stated = ratio_variance(mean, (root @ root.conj().T)[..., None])
-    assert np.mean(np.abs(ratio) ** 2) == pytest.approx(stated[0], rel=4 / np.sqrt(200_000))
+    scatter = (mean[0] + errors[0]) / (mean[1] + errors[1]) - mean[0] / mean[1]
+    stated = error_variance(ratio(mean), (root @ root.conj().T)[..., None]) / power(mean[1])
+    assert np.mean(np.abs(scatter) ** 2) == pytest.approx(stated[0], rel=4 / np.sqrt(200_000))
 
 
 @pytest.mark.parametrize(("periods", "said"), [(2, True), (8, False)])

@@ -9,7 +9,7 @@ from benchmarks.poles import MARGIN_HZ
 from benchmarks.poles_methods import local_polynomial_spectra
 from benchmarks.poles_plant import BAND_HZ, Plant
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import ratio_variance
+from tactile_resonance.frf.spectra import error_variance, power, ratio
 from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.noise_level import model_variance
 from tactile_resonance.poles.result import PolesStatus
@@ -86,8 +86,8 @@ def test_two_periods_raise_no_more_alarms_than_stated():
     lines_hz, spectra, covariance, dof = local_polynomial_spectra(plant, u, y, wide)
     frf = FRF(
         lines_hz,
-        spectra[:, 0] / spectra[:, 1],
-        variance_noise=ratio_variance(spectra, covariance),
+        ratio(spectra),
+        variance_noise=error_variance(ratio(spectra), covariance) / power(spectra[:, 1]),
         noise_dof=dof,
         periods=2,
     )

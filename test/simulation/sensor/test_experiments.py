@@ -4,7 +4,7 @@ import pytest
 
 from tactile_resonance.frf.distortion import estimate_distortion
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.frf.variance_analysis import analyse_variance
+from tactile_resonance.frf.variance_analysis import PAPER_AXES, nested_means
 from tactile_resonance.simulation.sensor.experiments import records_at_levels, repeated_records
 
 
@@ -48,8 +48,9 @@ def test_sources_of_variance_come_in_the_papers_order():
     g = lines[..., 0, :, :] / lines[..., 1, :, :]
     places = np.indices(g.shape[:-1]).reshape(4, -1)
     groups = np.stack([0 * places[0], *places[:-1]], axis=1)
-    analysis = analyse_variance(g.reshape(-1, g.shape[-1]), frequency_hz[inside], groups)
-    levels = [source.rms_level_db for source in reversed(analysis.sources)]
+    found = nested_means(g.reshape(-1, g.shape[-1]), groups, PAPER_AXES)
+    lines = np.ones(g.shape[-1], bool)
+    levels = [found.rms_level_db(source, lines) for source in reversed(found.levels)]
     assert np.all(np.diff(levels) > 0)
     assert levels[-1] < -25
-    assert [source.dof for source in reversed(analysis.sources)] == [27, 18, 6, 2]
+    assert [source.dof for source in reversed(found.levels)] == [27, 18, 6, 2]
