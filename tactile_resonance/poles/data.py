@@ -97,6 +97,11 @@ class BinData(NamedTuple):
         out[:, self.undriven :] = self.variance_y
         return out
 
+    @property
+    def lines(self) -> IntArray:
+        """(points,) driven bins that are not left out."""
+        return np.asarray(np.isfinite(self.variance[:, self.undriven :]).sum(axis=1))
+
     def rows(self, which: slice | npt.NDArray) -> BinData:
         """Some of the points."""
         u = self.u if len(self.u) < len(self.y) else self.u[which]

@@ -169,7 +169,7 @@ class DriftingModes:
 
     @cached_property
     def _s(self) -> ComplexArray:
-        return np.asarray(2j * np.pi * self.plan.frequency_hz(self.plan.bins))
+        return np.asarray(2j * np.pi * self.plan.frequency_hz)
 
     @cached_property
     def _lines(self) -> ComplexArray:

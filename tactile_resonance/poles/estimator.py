@@ -353,7 +353,7 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch, ratio: float) -> flo
 
     Of a fit weighted with another ratio.
     """
-    gain = np.abs(of_all.fit.response(plan.frequency_hz(plan.bins))) ** 2
+    gain = np.abs(of_all.fit.response(plan.frequency_hz)) ** 2
     variance = np.abs(of_all.residual) ** 2 * (1 + ratio * gain)
     curve = two_channels(variance[None], gain[None])[0]
     low, high = np.argmin(gain), np.argmax(gain)
@@ -366,7 +366,7 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch, ratio: float) -> flo
 @np.errstate(all="ignore")  # a fit that failed explains nothing
 def _explained(plan: JointPlan, of_all: PolesBatch, u: ComplexArray) -> float:
     """Mean square of ``G U`` between harmonics over the variance of ``Y - G U``."""
-    g = of_all.fit.response(plan.frequency_hz(plan.other_bins))
+    g = of_all.fit.response(plan.frequency_hz[plan.others_at])
     made = np.mean(np.abs(g * u[..., plan.others_at]) ** 2)
     noise_y, noise_u = of_all.noise_variance
     return float(made / (noise_y + noise_u * np.mean(np.abs(g) ** 2)))

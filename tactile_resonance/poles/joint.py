@@ -24,17 +24,11 @@ import numpy.typing as npt
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.poles.basis import (
-    PolynomialBasis,
-    default_transient_terms,
-    transient_basis,
-)
+from tactile_resonance.poles.basis import default_transient_terms, transient_basis
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint_fit import fit_records
 from tactile_resonance.poles.judgement import assemble
-from tactile_resonance.poles.lacking import Directions
-from tactile_resonance.poles.model import Variable
 from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.starts import best_of_split
@@ -227,28 +221,9 @@ class JointPlan(FitPlan):
         return np.append(self.others_at, self.excited_at)
 
     @cached_property
-    def variable(self) -> Variable:
-        """Of the polynomials."""
-        return Variable.for_lines(self.frequency_hz(self.bins), self.structure)
-
-    @cached_property
-    def _x(self) -> ComplexArray:
-        return self.variable.of_frequency(self.frequency_hz(self.bins))
-
-    @cached_property
-    def denominator_basis(self) -> PolynomialBasis:
-        """Orthonormal on all bins."""
-        return PolynomialBasis.on_lines(self._x, self.structure.order)
-
-    @cached_property
-    def numerator_basis(self) -> PolynomialBasis:
-        """Orthonormal on the excited bins."""
-        return PolynomialBasis.on_lines(self._x[self.excited_at], self.structure.numerator_order)
-
-    @cached_property
     def numerator_on_bins(self) -> ComplexArray:
         """(K, b) values of `numerator_basis` on all bins."""
-        return self.numerator_basis.at(self._x, 0)[0]
+        return self.numerator_basis.at(self.x, 0)[0]
 
     @cached_property
     def transient_on_bins(self) -> ComplexArray:
@@ -257,7 +232,7 @@ class JointPlan(FitPlan):
         if terms is None:
             terms = default_transient_terms(self.structure)
         return transient_basis(
-            self.frequency_hz(self.bins), terms, self.sample_rate_hz, self.band_hz, self.structure
+            self.frequency_hz, terms, self.sample_rate_hz, self.band_hz, self.structure
         )
 
     @cached_property
@@ -286,24 +261,10 @@ class JointPlan(FitPlan):
         """Spacing of the bins: one over the duration of the record."""
         return self.sample_rate_hz / (self.samples_per_period * self.periods)
 
-    def frequency_hz(self, bins: IntArray) -> FloatArray:
-        """Of bins."""
-        return np.asarray(bins * self.resolution_hz, float)
-
     @cached_property
-    def directions(self) -> Directions:
-        """What a richer model has in addition, on the driven bins."""
-        x = self._x[self.excited_at]
-        return Directions.on_lines(
-            self.frequency_hz(self.excited_bins), x, self.structure.numerator_order
-        )
-
-    @cached_property
-    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Bases of A, B and C on the driven bins."""
-        at = self.excited_at
-        of_a, of_c = self.denominator_basis.values[at], self.transient_on_bins[at]
-        return of_a, self.numerator_basis.values, of_c
+    def frequency_hz(self) -> FloatArray:
+        """(K,) of all bins."""
+        return np.asarray(self.bins * self.resolution_hz, float)
 
     def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
         """Poles of a fit, in the band or not, and their covariance as its residuals show it."""

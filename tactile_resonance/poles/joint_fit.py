@@ -125,9 +125,9 @@ class _Round:
 
         Of a wrong fit the transients hold part of what realisations differ by; those of a right one hide some.
         """
-        problem, driven, data = self.plan.problem, slice(self.data.undriven, None), self.data
-        alpha, _, gamma = problem.split(self.solution.theta)
-        transient = (gamma @ problem.transient[driven].T) / (alpha @ problem.denominator[driven].T)
+        problem, data = self.plan.problem, self.data
+        (alpha, _, gamma), (of_a, _, of_c) = problem.split(self.solution.theta), problem.driven_bases
+        transient = (gamma @ of_c.T) / (alpha @ of_a.T)
         with np.errstate(divide="ignore", invalid="ignore"):
             return data.y_driven / data.u_driven, (data.y_driven - transient) / data.u_driven
 

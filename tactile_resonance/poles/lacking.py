@@ -218,14 +218,11 @@ class Lack:
         exceeded by chance with ``(1 - R)^(dof - 1)``.
         """
         directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
-        variance, cost = data.variance_y, solution.cost
-        used = np.full(cost.size, data.driven)
-        if variance.shape[1] > 1:
-            used = np.isfinite(variance).sum(axis=1)
-        dof = data.records * (data.undriven + used) - inverse.shape[-1] / 2  # (batch,)
+        cost = solution.cost
+        dof = data.records * (data.undriven + data.lines) - inverse.shape[-1] / 2  # (batch,)
         rest, modes = np.maximum(dof - 1, 0.5), directions.modes
         fall, doubted, asked, taken, left = _falls(
-            *(data, plan.driven_bases, solution.theta, inverse, directions.numerator, modes),
+            *(data, plan.problem.driven_bases, solution.theta, inverse, directions.numerator, modes),
             *(cost, 1 / rest),
         )
         enough = dof > FEWEST_DOF

@@ -352,11 +352,8 @@ def _taken_by_transients(plan: JointPlan, solution: Solution, variance: FloatArr
     there.
     """
     a, b, own = plan.problem.sizes
-    problem = plan.problem
-    driven = slice(problem.undriven, None)
-    alpha, _, _ = plan.problem.split(solution.theta[:, 0])
-    size = alpha @ problem.denominator[driven].T
-    basis = problem.transient[driven]
+    of_a, _, basis = plan.problem.driven_bases
+    size = plan.problem.split(solution.theta[:, 0])[0] @ of_a.T
     blocks = solution.normal[..., a + b :, a + b :].sum(axis=2)
     inverse = invert(blocks.reshape(-1, own, own))[0].reshape(blocks.shape).sum(axis=1)
     products = np.real(basis.conj()[:, :, None] * basis[:, None, :]).reshape(-1, own * own)

@@ -206,7 +206,7 @@ def dispensable(plan: LinesPlan, row: BinData, theta: FloatArray, cost: float) -
     above = poles[poles.imag > 0]
     if less is None:
         return np.empty(0, complex)
-    lines = int(np.isfinite(_variance(plan, row)).sum())
+    lines = int(row.lines[0])
     limit = fall_of_noise(lines) * cost / (lines - theta.size / 2)
     out = []
     for k, pole in enumerate(above):
@@ -232,8 +232,7 @@ def _minimum_from(
     plan: LinesPlan, row: BinData, poles: ComplexArray
 ) -> tuple[LinesPlan, DenseSolution] | None:
     """Fit that begins with these poles, of a plan with bases that suit them; None where there is none."""
-    x = plan.variable.of_frequency(plan.frequency_hz)
-    logarithm = 2 * np.sum(np.log(np.abs(x[:, None] - plan.variable.of_s(poles))), axis=-1)
+    logarithm = 2 * np.sum(np.log(np.abs(plan.x[:, None] - plan.variable.of_s(poles))), axis=-1)
     there = plan.of_size(row, np.exp(logarithm - logarithm.mean()))
     start = None if there is None else _coefficients(there, row, poles)
     if there is None or start is None or not np.isfinite(start).all():
@@ -262,7 +261,7 @@ def _most_lacking(
     plan: LinesPlan, row: BinData, solution: DenseSolution, tried: ComplexArray
 ) -> tuple[complex, float]:
     """The mode that is missed most, and the logarithm of how likely noise alone misses it; see `lacking`."""
-    variance = _variance(plan, row)
+    variance = row.variance[0]
     used = np.isfinite(variance)
     jacobian = solution.jacobian[0][used].reshape(-1, solution.theta.size)
     basis = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0]
@@ -309,21 +308,16 @@ def _falls(
     return np.where(determinant > LEAST_LEFT * whole, fall, 0.0)
 
 
-def _variance(plan: LinesPlan, row: BinData) -> FloatArray:
-    """(F,) of Y."""
-    return np.broadcast_to(row.variance_y[0], plan.frequency_hz.shape)
-
-
 def _linear_cost(plan: LinesPlan, row: BinData, poles: ComplexArray) -> float:
     """Cost with given poles and the residues that fit best, of a variance that does not depend on them."""
     roots = plan.variable.of_s(poles)
-    x = plan.variable.of_frequency(plan.frequency_hz)[:, None]
+    x = plan.x[:, None]
     above, real = roots[roots.imag > 0], roots[roots.imag == 0]
     first, second, single = 1 / (x - above), 1 / (x - above.conj()), 1 / (x - real)
     terms = plan.structure.numerator_order - plan.structure.order
-    rest = PolynomialBasis.on_lines(x[:, 0], max(terms, 0)).values if terms >= 0 else np.empty((x.size, 0))
+    rest = PolynomialBasis.on_lines(plan.x, max(terms, 0)).values if terms >= 0 else np.empty((x.size, 0))
     columns = np.concatenate([first + second, 1j * (first - second), single, rest], axis=1)
-    variance = _variance(plan, row)
+    variance = row.variance[0]
     used = np.isfinite(variance)
     weight = 1 / np.sqrt(variance[used])
     columns = columns[used] * (weight * row.u[0, 0][used])[:, None]

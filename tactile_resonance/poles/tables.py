@@ -221,6 +221,12 @@ class Problem:
         compiled()  # here and not in the first fit, whose time may matter
         return Tables.of(self.denominator, self.numerator, self.transient)
 
+    @property
+    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Of A, B and C on the driven bins."""
+        driven = slice(self.undriven, None)
+        return self.denominator[driven], self.numerator, self.transient[driven]
+
     def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients of A (with its last), B and C, each (..., terms), of theta (..., n)."""
         a, b, _ = self.sizes
