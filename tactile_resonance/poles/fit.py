@@ -18,13 +18,10 @@ from scipy import optimize
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.likelihood import ROUNDING, STEP_TOLERANCE, Rules
 from tactile_resonance.poles.tables import Problem
 
-MAX_ITERATIONS = 60
-# A step below this many standard deviations, as the residuals show them, is the last one taken.
-STEP_TOLERANCE = 1e-2
-# Rounding of a residual relative to the data it is the residual of.
-ROUNDING = 1e-14
+ORDINARY = Rules()
 # Of a fit at full precision.
 LEAST_SQUARES_STARTS = 20
 LEAST_SQUARES_EVALUATIONS = 200
@@ -109,14 +106,11 @@ class Solution:
         return np.einsum("bmik,bmkl,bmjl->bij", rows, normal, rows)
 
 
-RULES = likelihood.Rules(MAX_ITERATIONS, STEP_TOLERANCE, ROUNDING, 0, 0, 0.0, 0.0)
-
-
 def minimise(
     problem: Problem,
     data: BinData,
     start: FloatArray | None = None,
-    rules: likelihood.Rules = RULES,
+    rules: Rules = ORDINARY,
 ) -> Solution:
     """Minimise the cost of each point.
 

@@ -66,6 +66,10 @@ EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
 TINY = float(np.finfo(float).tiny)
 MOST_INVERTED = 1 / float(np.finfo(float).eps)
 """Condition of a matrix of which rounding leaves nothing of the inverse."""
+# The last step is one that the next one would be so many standard deviations of, as the residuals show them.
+STEP_TOLERANCE = 1e-2
+# Rounding of a residual relative to the data it is the residual of.
+ROUNDING = 1e-14
 MOST_DAMPING = 1e10
 LEAST_DAMPING = 1e-3
 # A step is the last one, too, where the next one would be smaller than the tolerance by this factor, should
@@ -82,10 +86,6 @@ class Rules(NamedTuple):
     ----------
     iterations : int
         Most steps tried.
-    tolerance : float
-        Of the last step: so many standard deviations, as the residuals show them, would be the next one.
-    rounding : float
-        Of a residual relative to the data it is the residual of.
     pieces, size : int
         Of the undriven bins: how many pieces, of how many bins, the last one longer. With no piece the data
         bring their variances; else their undriven bins show them, where these are flat noise.
@@ -96,13 +96,11 @@ class Rules(NamedTuple):
         Largest ``log mean - mean log`` of the variances of pieces that is flat.
     """
 
-    iterations: int
-    tolerance: float
-    rounding: float
-    pieces: int
-    size: int
-    chance: float
-    flat: float
+    iterations: int = 60
+    pieces: int = 0
+    size: int = 0
+    chance: float = 0.0
+    flat: float = 0.0
 
 
 class _Work(NamedTuple):
@@ -229,9 +227,7 @@ def _load_noise(data, point, before, values):
 def _fill(values, row, entries, bins):
     """A row of blocks, of entries for each of the bins, of one for all, or of none."""
     if entries.size == 1:
-        for block in range(values.shape[0]):
-            for k in range(BLOCK):
-                values[block, row * BLOCK + k] = entries[0]
+        values[:, row * BLOCK : (row + 1) * BLOCK] = entries[0]
     elif entries.size > 1:
         for k in range(bins):
             values[k // BLOCK, row * BLOCK + k % BLOCK] = entries[k]
@@ -482,18 +478,16 @@ def _solve(work, which, c, damping):
 def _inside(theta, point, c, at, g):
     """Coefficients in the order C, A, B from [A, B, C]."""
     n = theta.shape[2]
-    for m in range(theta.shape[1]):
-        for i in range(n):
-            at[g, m, i] = theta[point, m, i + n - c if i < c else i - c]
+    at[g, :, :c] = theta[point, :, n - c :]
+    at[g, :, c:n] = theta[point, :, : n - c]
 
 
 @inner
 def _outside(at, g, c, theta, point):
     """Coefficients in the order [A, B, C] from C, A, B."""
     n = theta.shape[2]
-    for m in range(theta.shape[1]):
-        for i in range(n):
-            theta[point, m, i + n - c if i < c else i - c] = at[g, m, i]
+    theta[point, :, n - c :] = at[g, :, :c]
+    theta[point, :, : n - c] = at[g, :, c:n]
 
 
 @inner
@@ -580,18 +574,11 @@ def _weight_with(values, gram, cost, g, before, variance_y, variance_u):
     """Flat variances, in memory and in what sums there are of undriven bins."""
     factor = 1 / variance_y
     change = factor / values[g, 0, 0, INVERSE * BLOCK]
-    for m in range(gram.shape[1]):
-        for i in range(gram.shape[3]):
-            gram[g, m, 0, i] *= change
+    gram[g, :, 0] *= change
     cost[g, 0] *= change
-    for m in range(gram.shape[1]):
-        for block in range(values.shape[2]):
-            of, driven = values[g, m, block], block >= before
-            for k in range(BLOCK):
-                of[INVERSE * BLOCK + k] = variance_y if driven else factor
-            if driven:
-                for k in range(BLOCK):
-                    of[VARIANCE_U * BLOCK + k] = variance_u
+    values[g, :, :before, INVERSE * BLOCK : (INVERSE + 1) * BLOCK] = factor
+    values[g, :, before:, VARIANCE_Y * BLOCK : (VARIANCE_Y + 1) * BLOCK] = variance_y
+    values[g, :, before:, VARIANCE_U * BLOCK : (VARIANCE_U + 1) * BLOCK] = variance_u
 
 
 @inner
@@ -699,12 +686,12 @@ def _descend(tables, work, which, rules, last_fall, total, converged):
     """
     c, n = tables.c, tables.a + tables.b + tables.c
     records, bins = work.at.shape[1], tables.undriven.bins + tables.driven.bins
-    tolerance = rules.tolerance**2 / max(records * (2 * bins - c) - (n - c), 1)
+    tolerance = STEP_TOLERANCE**2 / max(records * (2 * bins - c) - (n - c), 1)
     damping, floor = np.zeros(work.fall.size), np.zeros(work.fall.size)
     for g in which:
         total[g], converged[g] = work.cost[g, 0] + work.cost[g, 1], False
         power = _weighted_power(work.values[g], tables.undriven.last.shape[0])
-        floor[g] = rules.rounding**2 * power
+        floor[g] = ROUNDING**2 * power
     which = which.copy()
     count = which.size
     for _ in range(rules.iterations):

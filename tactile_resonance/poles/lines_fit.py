@@ -16,7 +16,6 @@ from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
-    RULES,
     DenseSolution,
     Linearised,
     Solution,
@@ -24,6 +23,7 @@ from tactile_resonance.poles.fit import (
     linear_step,
     minimise,
 )
+from tactile_resonance.poles.likelihood import Rules
 from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.starts import (
@@ -42,7 +42,7 @@ NORMAL_EQUATIONS_LIMIT = 1e5
 # Models of more poles than this go to the dense solver at once.
 LARGEST_BATCHED_ORDER = 6
 REBASE_ITERATIONS = 40
-ONLY_START = RULES._replace(iterations=0)
+ONLY_START = Rules(iterations=0)
 # Bases follow the denominator until it changes by less than this from one iteration to the next.
 REBASE_TOLERANCE = 1e-2
 

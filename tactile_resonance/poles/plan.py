@@ -13,8 +13,9 @@ import numpy as np
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import RULES, Solution, minimise
+from tactile_resonance.poles.fit import Solution, minimise
 from tactile_resonance.poles.lacking import Directions
+from tactile_resonance.poles.likelihood import Rules
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.modes import (
     beside_others,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 # Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
 # in particular.
-COMPARISON = RULES._replace(iterations=8)
+COMPARISON = Rules(iterations=8)
 
 
 class FitPlan(ABC):

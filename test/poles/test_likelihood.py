@@ -10,9 +10,9 @@ from scipy import stats
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import RULES, Linearised, least_squares, minimise, refit_failed
+from tactile_resonance.poles.fit import Linearised, least_squares, minimise, refit_failed
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.likelihood import invert, moments
+from tactile_resonance.poles.likelihood import Rules, invert, moments
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
@@ -61,7 +61,7 @@ def problem_and_data(points, records, errors_in_variables, transient, driven=15)
 
 
 def start_values(problem, data):
-    return minimise(problem, data, None, RULES._replace(iterations=0)).theta
+    return minimise(problem, data, None, Rules(iterations=0)).theta
 
 
 def flat_theta(problem, theta):
@@ -147,7 +147,7 @@ def test_points_that_steps_lost_are_found_at_full_precision(records):
     """Searches ended at once, all or some of a batch: what comes back is what they would have found."""
     problem, data = problem_and_data(5, records, False, True)
     found = minimise(problem, data)
-    lost = minimise(problem, data, None, RULES._replace(iterations=0))
+    lost = minimise(problem, data, None, Rules(iterations=0))
     assert found.converged.all()
     assert not lost.converged.any()
     some = dataclasses.replace(found, converged=np.arange(5) != 2, theta=found.theta.copy())
