@@ -220,7 +220,7 @@ def _linearised(
     """
     plan, u, theta = modes.plan, modes.u, modes.theta
     directions = np.concatenate([modes.directions(row) for row in rows])
-    others = plan.other_bins.size
+    others = plan.others_at.size
     data = BinData.of(y[None, None], u[None, None], plan.order, others)
     if not flat:
         data, *_ = with_noise(plan, data, theta[None, None])

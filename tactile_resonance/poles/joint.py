@@ -89,7 +89,7 @@ class JointPlan(FitPlan):
 
     def __post_init__(self) -> None:
         self._check()
-        lines, fewest = self.excited_bins.size, self.structure.fewest_lines
+        lines, fewest = self.excited_at.size, self.structure.fewest_lines
         if lines <= fewest:
             raise ValueError(
                 f"band_hz: {self.band_hz} holds {lines} excited lines, "
@@ -165,16 +165,13 @@ class JointPlan(FitPlan):
                 raise ValueError(
                     f"{name}: shape {values.shape}, expected (..., {self.bins.size}) bins"
                 )
-        if u.shape == y.shape:
-            return u, y
         try:
-            shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
+            u, y = np.broadcast_arrays(u, y)
         except ValueError:
             raise ValueError(
                 f"y: shape {y.shape}, expected leading axes like those of u, {u.shape}"
             ) from None
-        whole = (*shape, self.bins.size)
-        return np.broadcast_to(u, whole), np.broadcast_to(y, whole)
+        return u, y
 
     @cached_property
     def bins(self) -> IntArray:
@@ -204,16 +201,6 @@ class JointPlan(FitPlan):
     def others_at(self) -> IntArray:
         """(K_o,) places of the bins that show transient and noise alone."""
         return np.flatnonzero(self._between & self._kept)
-
-    @property
-    def excited_bins(self) -> IntArray:
-        """(K_e,) of the DFT of the whole record."""
-        return self.bins[self.excited_at]
-
-    @property
-    def other_bins(self) -> IntArray:
-        """(K_o,)."""
-        return self.bins[self.others_at]
 
     @cached_property
     def order(self) -> IntArray:
@@ -247,7 +234,7 @@ class JointPlan(FitPlan):
     @property
     def level_known(self) -> bool:
         """Whether the noise of one record is known from more than the residuals."""
-        return self.other_bins.size > 0 or self.input_noise_ratio is not None
+        return self.others_at.size > 0 or self.input_noise_ratio is not None
 
     def with_structure(self, structure: ModelStructure) -> JointPlan | None:
         """The plan of another structure; None where the band holds too few lines for it."""

@@ -110,7 +110,7 @@ def with_noise(
         y = data.y.copy()
         y[..., others] -= through.reshape(len(y), -1, records).swapaxes(1, 2)
         data = data._replace(y=y)
-    before = np.searchsorted(plan.other_bins, plan.excited_bins)
+    before = np.searchsorted(plan.others_at, plan.excited_at)
     of_excited = pieces.of_bin[np.minimum(before, data.undriven - 1)]
     weighted = data.weighted(
         rest=_on(pieces.of_bin, np.where(rest_power > TINY, rest_power, 1.0)),

@@ -90,7 +90,7 @@ def _split_starts(
     model = plan.model_of(theta[:, 0])
     start = np.full(theta.shape, np.nan)
     poles_of_all = model.poles_rad_s()  # (points, a)
-    heights = np.abs(model.residues(poles_of_all)) / np.abs(poles_of_all.real)
+    heights = np.abs(model.residues_and_sensitivity(poles_of_all)[0]) / np.abs(poles_of_all.real)
     for k, of_point in enumerate(poles_of_all):
         above, height = (values[of_point.imag > 0] for values in (of_point, heights[k]))
         if above.size < 2 or not np.isfinite(height).all():

@@ -265,7 +265,7 @@ def test_every_length_of_numerators(terms, numerator_order):
     u, y = points_of(plant)
     one = np.full((POINTS, 1), plant.noise[0])
     data = BinData.of(
-        y[:, None], u[:, None], plan.order, plan.other_bins.size, rest=one, variance_y=one
+        y[:, None], u[:, None], plan.order, plan.others_at.size, rest=one, variance_y=one
     )
     found = minimise(plan.problem, data)
     refit_failed(plan.problem, found, data)
@@ -282,7 +282,7 @@ def test_odd_points_leave_the_others_of_a_batch_alone():
     clean = plan.from_bins(u, y)
     rng = np.random.default_rng(5)
     noise = rng.standard_normal((POINTS, 2 * y.shape[1])).view(complex) * np.sqrt(plant.noise[0])
-    others = np.isin(plan.bins, plan.other_bins)
+    others = np.isin(plan.bins, plan.bins[plan.others_at])
     y[1, 100] += 300 * noise[1, 100]  # a wild bin
     u[2, 7] = np.nan
     y[3] += noise[3] * np.linspace(0, 5, y.shape[1])  # sloped noise
