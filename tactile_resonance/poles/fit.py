@@ -395,8 +395,13 @@ def linear_step(problem: Problem, data: BinData, size: FloatArray) -> FloatArray
     scale = 1 / (np.sqrt(data.variance[0]) * size)
     design *= scale[..., None]
     target = -y * problem.denominator[:, a] * scale
-    rows = np.stack([design.real, design.imag]).reshape(-1, design.shape[-1])
-    right = np.stack([target.real, target.imag]).ravel()
+    return real_solution(design.reshape(-1, design.shape[-1]), target.ravel())
+
+
+def real_solution(matrix: ComplexArray, right: ComplexArray) -> FloatArray:
+    """Real least squares solution of complex equations, whatever the scales of its unknowns."""
+    rows = np.concatenate([matrix.real, matrix.imag])
+    right = np.concatenate([right.real, right.imag])
     column = np.linalg.norm(rows, axis=0)
     column[~(column > 0)] = 1.0
     if not np.isfinite(rows).all() or not np.isfinite(right).all():

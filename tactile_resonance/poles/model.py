@@ -109,7 +109,7 @@ class RationalModel:
     def residues_and_sensitivity(
         self, poles_rad_s: ComplexArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Residues (..., k) of ``B / A`` at simple poles (..., k) [rad/s], and derivatives (..., k, n) of these.
+        """Residues (..., k) of ``B / A`` at simple poles (..., k) [rad/s], and derivatives (..., k, n).
 
         In the z-domain residues are of the s-plane function with the same behaviour close to the pole. The
         derivatives are those of the poles by the free coefficients of A.

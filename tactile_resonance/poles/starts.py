@@ -30,6 +30,7 @@ from tactile_resonance.poles.fit import (
     Solution,
     least_squares,
     minimise,
+    real_solution,
 )
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
 from tactile_resonance.poles.modes import fall_of_noise
@@ -117,27 +118,17 @@ def _coefficients(plan: FitPlan, data: BinData, poles: ComplexArray) -> FloatArr
     logarithm = np.sum(np.log(x[:, None] - roots), axis=-1)  # many factors over decades overflow
     phase = np.exp(1j * logarithm.imag)  # A / |A|
     weighted = basis * np.exp(np.mean(logarithm.real) - logarithm.real)[:, None]
-    denominator = _real_solution(weighted, phase)
+    denominator = real_solution(weighted, phase)
     theta = np.zeros(a + b + data.records * own)
     theta[:a] = denominator[:-1] / denominator[-1]
     linear = Linearised.of(plan.problem, data, theta)
     used = np.isfinite(linear.variance)
     weight = np.tile(1 / np.sqrt(linear.variance[used]), data.records)
-    theta[a:] = _real_solution(
+    theta[a:] = real_solution(
         linear.slope[:, used, a:].reshape(weight.size, -1) * weight[:, None],
         linear.error[:, used].ravel() * weight,
     )
     return theta
-
-
-def _real_solution(matrix: ComplexArray, right: ComplexArray) -> FloatArray:
-    """Real least squares solution of complex equations, whatever the scales of its unknowns."""
-    rows = np.concatenate([matrix.real, matrix.imag])
-    scale = np.linalg.norm(rows, axis=0)
-    right = np.concatenate([right.real, right.imag])
-    if not (np.isfinite(rows).all() and np.isfinite(right).all() and (scale > 0).all()):
-        return np.full(scale.size, np.nan)
-    return np.linalg.lstsq(rows / scale, right, rcond=None)[0] / scale
 
 
 @np.errstate(all="ignore")
