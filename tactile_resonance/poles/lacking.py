@@ -25,7 +25,7 @@ from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import Solution
+from tactile_resonance.poles.likelihood import Solution
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:

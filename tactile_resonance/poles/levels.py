@@ -16,9 +16,8 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.fit import Solution
 from tactile_resonance.poles.joint_noise import BINS_PER_BAND
-from tactile_resonance.poles.likelihood import invert
+from tactile_resonance.poles.likelihood import Solution, invert
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.noise_level import (
     Pieces,

@@ -22,11 +22,13 @@ for all of them; each goes its own way.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from tactile_resonance._typing import FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.compiled import entry, inner
 
 BLOCK = 48
@@ -101,6 +103,83 @@ class Rules(NamedTuple):
     size: int = 0
     chance: float = 0.0
     flat: float = 0.0
+
+
+class Solution(NamedTuple):
+    """Coefficients of points.
+
+    Attributes
+    ----------
+    theta : (points, M, n) float
+        Coefficients [A without its last, B, C] of each record; A and B are alike in all.
+    cost : (points,) float
+    part_cost : (points, 2) float
+        Of undriven and driven bins.
+    residual : (points, M, K_driven) complex
+        Weighted errors, turned by the phase of the input: errors of a response are smooth over lines,
+        those of Y only after this, for the phases of the excitation are random.
+    converged : (points,) bool
+    normal : (points, M, 2, n, n) float
+        ``Re J^H J`` of undriven and of driven bins, where the last step began; empty of single records.
+    marginal : (points, M, n, n) float
+        Blocks of the inverse of the normal matrix: of the coefficients that records share and those of one;
+        NaN where it is singular or not finite.
+    condition : (points,) float
+        See `invert`.
+    leverage : (points, 2) float
+        Real coefficients that go to undriven and to driven bins.
+    noise : (points, 2) float
+        Variances of Y and U that undriven bins show; NaN where they were not asked for.
+    plain : (points,) bool
+        False where undriven bins show noise other than flat, or alike in both channels: not fitted yet.
+    """
+
+    theta: FloatArray
+    cost: FloatArray
+    part_cost: FloatArray
+    residual: ComplexArray
+    converged: BoolArray
+    normal: FloatArray
+    marginal: FloatArray
+    condition: FloatArray
+    leverage: FloatArray
+    noise: FloatArray
+    plain: BoolArray
+
+    def rows(self, which: npt.NDArray) -> Solution:
+        """Some of the points."""
+        return Solution._make(x[which] if len(x) else x for x in self)
+
+    @classmethod
+    def joined(cls, solutions: Sequence[Solution]) -> Solution:
+        """Of the points of all."""
+        return cls(*(np.concatenate(arrays) for arrays in zip(*solutions, strict=True)))
+
+    def put(self, which: npt.NDArray, others: Solution) -> None:
+        """Write other solutions in place of some; what undriven bins show stays as it was found."""
+        for name, here, there in zip(self._fields, self, others, strict=True):
+            if name not in ("noise", "plain") and here.size:
+                here[which] = there
+
+    def inverse(self, shared: int) -> FloatArray:
+        """(points, s + M c, s + M c) of the normal matrix of all coefficients; NaN where `marginal` is."""
+        points, records, n = self.theta.shape
+        if records == 1:
+            return self.marginal[:, 0]
+        normal, own = self.normal.sum(axis=2), n - shared
+        whole = np.zeros((points, *2 * [shared + records * own]))
+        whole[:, :shared, :shared] = normal[:, :, :shared, :shared].sum(axis=1)
+        for m in range(records):
+            here = slice(shared + m * own, shared + (m + 1) * own)
+            whole[:, here, :shared] = normal[:, m, shared:, :shared]
+            whole[:, :shared, here] = normal[:, m, :shared, shared:]
+            whole[:, here, here] = normal[:, m, shared:, shared:]
+        return invert(whole)[0]
+
+    def sandwich(self, normal: FloatArray, shared: int) -> FloatArray:
+        """(points, s, s) of the shared coefficients, of gradients with covariances (points, M, n, n)."""
+        rows = self.marginal[:, :, :shared]
+        return np.einsum("bmik,bmkl,bmjl->bij", rows, normal, rows)
 
 
 class _Work(NamedTuple):
@@ -868,26 +947,7 @@ def minimise(tables, data, start, rules):
 
     Returns
     -------
-    theta : (points, M, n) float
-    cost : (points,) float
-    part_cost : (points, 2) float
-        Of undriven and driven bins.
-    residual : (points, M, K_driven) complex
-        Weighted errors, turned by the phase of the input: errors of a response are smooth over lines,
-        those of Y only after this, for the phases of the excitation are random.
-    converged : (points,) bool
-    normal : (points, M, 2, n, n) float
-        Of undriven and of driven bins, where the last step began; empty of single records.
-    marginal : (points, M, n, n) float
-        Blocks of its inverse, of what records share and what belongs to one; NaN where there is none.
-    condition : (points,) float
-        See `invert`.
-    leverage : (points, 2) float
-        Real coefficients that go to undriven and to driven bins.
-    noise : (points, 2) float
-        Variances of Y and U that undriven bins show, where `rules` ask for them.
-    plain : (points,) bool
-        Whether these are all there is to the noise; others are left where it was found.
+    Solution
     """
     points, records = data.y.shape[:2]
     c, n = tables.c, tables.a + tables.b + tables.c
@@ -927,5 +987,6 @@ def minimise(tables, data, start, rules):
             )
             if records > 1:
                 _unpacked(work.gram, g, c, normal, point)
-    of_fit = (theta, cost, part_cost, residual, converged, normal)
-    return of_fit + (marginal, condition, leverage, noise, plain)
+    return Solution(
+        theta, cost, part_cost, residual, converged, normal, marginal, condition, leverage, noise, plain
+    )

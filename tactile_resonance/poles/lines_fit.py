@@ -18,12 +18,11 @@ from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     DenseSolution,
     Linearised,
-    Solution,
     least_squares,
     linear_step,
     minimise,
 )
-from tactile_resonance.poles.likelihood import Rules
+from tactile_resonance.poles.likelihood import Rules, Solution
 from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.starts import (

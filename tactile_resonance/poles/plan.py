@@ -13,9 +13,9 @@ import numpy as np
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import Solution, minimise
+from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.lacking import Directions
-from tactile_resonance.poles.likelihood import Rules
+from tactile_resonance.poles.likelihood import Rules, Solution
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.modes import (
     beside_others,
@@ -117,15 +117,8 @@ class FitPlan(ABC):
 
     def model_of(self, theta: FloatArray) -> RationalModel:
         """The model of coefficients (batch, n)."""
-        a, b, _ = self.problem.sizes
-        return RationalModel(
-            denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
-            numerator=theta[:, a : a + b],
-            transient=theta[:, a + b :],
-            variable=self.variable,
-            denominator_basis=self.denominator_basis,
-            numerator_basis=self.numerator_basis,
-        )
+        coefficients, bases = self.problem.split(theta), (self.denominator_basis, self.numerator_basis)
+        return RationalModel(*coefficients, self.variable, *bases)
 
     def poles_in_band(self, theta: FloatArray) -> ComplexArray:
         """(batch, places) poles [rad/s] of coefficients (batch, n)."""

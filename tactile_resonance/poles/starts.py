@@ -27,12 +27,12 @@ from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     DenseSolution,
     Linearised,
-    Solution,
     least_squares,
     minimise,
     real_solution,
 )
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
+from tactile_resonance.poles.likelihood import Solution
 from tactile_resonance.poles.modes import fall_of_noise
 from tactile_resonance.poles.plan import FitPlan
 
