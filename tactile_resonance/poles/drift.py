@@ -344,7 +344,7 @@ def _result(modes: DriftingModes, drift: FloatArray, at: _Step) -> Poles:
     added = at.coefficients @ covariance @ at.coefficients.T
     pole = fit.poles_rad_s
     sensitivity = fit.fit.residues_and_sensitivity(pole)[1]
-    more, in_f0 = propagated(pole, sensitivity, added)
+    more, in_f0 = (of[0] for of in propagated(pole[None], sensitivity[None], added[None]))
     fit = replace(
         fit,
         coefficient_covariance=fit.coefficient_covariance + added,

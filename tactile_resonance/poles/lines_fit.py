@@ -268,11 +268,8 @@ def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[Floa
     candidates = []
     for delay in step * np.arange(-2, 13):
         turned = row._replace(y=row.y * np.exp(1j * phase * delay))
-        theta = minimise(problem, turned, None, ONLY_START).theta[0, 0]
-        if not np.isfinite(theta).all():
-            continue
-        residual = Linearised.of(problem, turned, theta).residual
-        cost = float(np.sum(residual.real**2 + residual.imag**2))
-        candidates.append((cost, np.append(theta, delay)))
+        begun = minimise(problem, turned, None, ONLY_START)
+        if np.isfinite(begun.theta).all():
+            candidates.append((float(begun.cost[0]), np.append(begun.theta[0, 0], delay)))
     candidates.sort(key=lambda c: c[0])
     return [theta for _, theta in candidates[:3]] or [None]

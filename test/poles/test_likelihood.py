@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cost against its formula, the fit against full precision, points against the same in a batch."""
 
-import dataclasses
 
 import numpy as np
 import pytest
@@ -150,7 +149,7 @@ def test_points_that_steps_lost_are_found_at_full_precision(records):
     lost = minimise(problem, data, None, Rules(iterations=0))
     assert found.converged.all()
     assert not lost.converged.any()
-    some = dataclasses.replace(found, converged=np.arange(5) != 2, theta=found.theta.copy())
+    some = found._replace(converged=np.arange(5) != 2, theta=found.theta.copy())
     some.theta[2] = lost.theta[2]
     refit_failed(problem, lost, data)
     assert_same(lost, found)
