@@ -88,7 +88,22 @@ class JointPlan(FitPlan):
     left_out: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        self._check()
+        for name in ("samples_per_period", "periods", "transient_terms"):
+            value = getattr(self, name)
+            if not (name == "transient_terms" and value is None):
+                good = isinstance(value, Integral) and int(value) >= 1
+                require(good, name, value, "a whole number, at least 1")
+        rate_hz = number(self.sample_rate_hz, "sample_rate_hz")
+        require(rate_hz > 0, "sample_rate_hz", rate_hz, "a number above 0")
+        band(self.band_hz, most_hz=rate_hz / 2)
+        require_kind(self.structure, "structure", ModelStructure)
+        if self.structure.domain == "z":
+            of_model = self.structure.sample_rate_hz
+            accepted = f"that of the record, {rate_hz:g} Hz"
+            require(of_model == rate_hz, "structure.sample_rate_hz", of_model, accepted)
+        if self.input_noise_ratio is not None:
+            ratio = number(self.input_noise_ratio, "input_noise_ratio")
+            require(ratio >= 0, "input_noise_ratio", ratio, "a number, 0 or above")
         lines, fewest = self.excited_at.size, self.structure.fewest_lines
         if lines <= fewest:
             raise ValueError(
@@ -269,24 +284,6 @@ class JointPlan(FitPlan):
         """(K,) which bins show transient and noise alone."""
         return ~self.driven
 
-    def _check(self) -> None:
-        for name in ("samples_per_period", "periods", "transient_terms"):
-            value = getattr(self, name)
-            if not (name == "transient_terms" and value is None):
-                good = isinstance(value, Integral) and int(value) >= 1
-                require(good, name, value, "a whole number, at least 1")
-        rate_hz = number(self.sample_rate_hz, "sample_rate_hz")
-        require(rate_hz > 0, "sample_rate_hz", rate_hz, "a number above 0")
-        band(self.band_hz, most_hz=rate_hz / 2)
-        require_kind(self.structure, "structure", ModelStructure)
-        if self.structure.domain == "z":
-            of_model = self.structure.sample_rate_hz
-            accepted = f"that of the record, {rate_hz:g} Hz"
-            require(of_model == rate_hz, "structure.sample_rate_hz", of_model, accepted)
-        if self.input_noise_ratio is not None:
-            ratio = number(self.input_noise_ratio, "input_noise_ratio")
-            require(ratio >= 0, "input_noise_ratio", ratio, "a number, 0 or above")
-
 
 @dataclass(frozen=True, eq=False)
 class PoleEstimator(JointPlan):
@@ -347,7 +344,7 @@ class PoleEstimator(JointPlan):
 
     @cached_property
     def _single(self) -> JointPlan:
-        return JointPlan(*(getattr(self, f.name) for f in fields(self) if f.init))
+        return JointPlan(*(getattr(self, f.name) for f in fields(self)))
 
     @property
     def _between(self) -> BoolArray:

@@ -295,11 +295,8 @@ def _load_noise(data, point, before, values):
     driven = data.order.size - data.undriven
     _fill(values[before:], VARIANCE_Y, data.variance_y[point], driven)
     _fill(values[before:], VARIANCE_U, data.variance_u[point], driven)
-    if both.size > 0:
-        for k in range(driven):
-            at, value = k % BLOCK, both[min(k, both.size - 1)]
-            of = values[before + k // BLOCK]
-            of[COVARIANCE * BLOCK + at], of[(COVARIANCE + 1) * BLOCK + at] = value.real, value.imag
+    _fill(values[before:], COVARIANCE, both.real, driven)
+    _fill(values[before:], COVARIANCE + 1, both.imag, driven)
 
 
 @inner
