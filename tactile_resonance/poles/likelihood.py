@@ -638,14 +638,6 @@ def _start(tables, work, which):
 
 
 @inner
-def _take(at, g, step, to):
-    """Coefficients of a point less a step."""
-    for m in range(step.shape[0]):
-        for i in range(step.shape[1]):
-            to[g, m, i] = at[g, m, i] - step[m, i, g]
-
-
-@inner
 def _weight_with(values, gram, cost, g, before, variance_y, variance_u):
     """Flat variances, in memory and in what sums there are of undriven bins."""
     factor = 1 / variance_y
@@ -691,7 +683,7 @@ def _from_noise(tables, work, which, rules, noise, plain, last_fall):
     `last_fall` (G,), what the step was expected to bring.
     """
     records, before = work.at.shape[1], tables.undriven.last.shape[0]
-    bins, c = tables.undriven.bins, tables.c
+    bins, c, n = tables.undriven.bins, tables.c, work.step.shape[1]
     values, sums = records * bins, np.empty(rules.pieces)
     for last in (False, True):
         _sums(tables, 0, work, which, work.at, EXACT, work.gram, work.cost)
@@ -721,7 +713,7 @@ def _from_noise(tables, work, which, rules, noise, plain, last_fall):
             _solve(work, which, c, np.zeros(work.fall.size))
             for g in which:
                 if np.isfinite(work.fall[g]):
-                    _take(work.at, g, work.step, work.at)
+                    work.at[g, :, :n] -= work.step[:, :, g]
                     last_fall[g] = work.fall[g]
 
 
@@ -781,13 +773,13 @@ def _descend(tables, work, which, rules, last_fall, total, converged):
                 fall <= max(tolerance * total[g], floor[g])
                 or fall * fall <= SURELY**2 * tolerance * total[g] * last_fall[g]
             ):
-                _take(work.at, g, work.step, work.at)
+                work.at[g, :, :n] -= work.step[:, :, g]
                 _expect(work.gram, g, work.step, work.cost)
                 total[g] = work.cost[g, 0] + work.cost[g, 1]
                 converged[g] = True
                 continue
             last_fall[g] = fall if damping[g] == 0 else 0.0
-            _take(work.at, g, work.step, work.trial)
+            work.trial[g, :, :n] = work.at[g, :, :n] - work.step[:, :, g]
             if not np.isfinite(fall):
                 work.trial[g, 0, 0] = np.nan
             which[left] = g
