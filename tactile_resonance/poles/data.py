@@ -100,7 +100,8 @@ class BinData(NamedTuple):
     @property
     def lines(self) -> IntArray:
         """(points,) driven bins that are not left out."""
-        return np.asarray(np.isfinite(self.variance[:, self.undriven :]).sum(axis=1))
+        used = np.isfinite(self.variance_y).sum(axis=1)
+        return used if self.variance_y.shape[1] > 1 else used * self.driven
 
     def rows(self, which: slice | npt.NDArray) -> BinData:
         """Some of the points."""

@@ -180,6 +180,8 @@ class JointPlan(FitPlan):
                 raise ValueError(
                     f"{name}: shape {values.shape}, expected (..., {self.bins.size}) bins"
                 )
+        if u.shape == y.shape:
+            return u, y
         try:
             u, y = np.broadcast_arrays(u, y)
         except ValueError:
