@@ -204,7 +204,7 @@ def _scalings(rounds: int) -> list[Scaling]:
     def modes(count: int) -> Callable[[], object]:
         harmonics = np.arange(40, 200)
         plan = JointPlan(5e3, 2000, 4, harmonics, (100.0, 499.0), ModelStructure(2 * count, 2 * count))
-        s = 2j * np.pi * plan.frequency_hz(plan.bins)
+        s = 2j * np.pi * plan.frequency_hz
         g = np.full(s.size, 0.1 + 0j)
         for f0_hz in np.linspace(150, 450, count):
             w0 = 2 * np.pi * f0_hz

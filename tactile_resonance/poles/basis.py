@@ -56,11 +56,6 @@ class PolynomialBasis:
             values[:, k + 1] = new / hessenberg[k + 1, k]
         return cls(values, hessenberg)
 
-    @property
-    def degree(self) -> int:
-        """Of the last polynomial."""
-        return self.hessenberg.shape[1]
-
     def at(self, x: ComplexArray, derivatives: int = 1) -> ComplexArray:
         """Values and derivatives at other points.
 
@@ -74,9 +69,10 @@ class PolynomialBasis:
         (1 + derivatives, ..., n + 1) complex
             Values, first derivatives, and so on.
         """
-        out = np.zeros((1 + derivatives, *np.shape(x), self.degree + 1), complex)
+        degree = self.hessenberg.shape[1]
+        out = np.zeros((1 + derivatives, *np.shape(x), degree + 1), complex)
         out[0, ..., 0] = 1.0
-        for k in range(self.degree):
+        for k in range(degree):
             new = x * out[..., k] - out[..., : k + 1] @ self.hessenberg[: k + 1, k]
             for order in range(1, 1 + derivatives):
                 new[order] += order * out[order - 1, ..., k]

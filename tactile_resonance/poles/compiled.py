@@ -96,8 +96,7 @@ def compiled() -> int:
 class _Notice(event.Listener):
     """Says on the log that kernels are compiled, as the first of them begins."""
 
-    def __init__(self) -> None:
-        self._said = False
+    _said = False
 
     def on_start(self, event: object) -> None:
         """Say it once."""

@@ -97,6 +97,12 @@ class BinData(NamedTuple):
         out[:, self.undriven :] = self.variance_y
         return out
 
+    @property
+    def lines(self) -> IntArray:
+        """(points,) driven bins that are not left out."""
+        used = np.isfinite(self.variance_y).sum(axis=1)
+        return used if self.variance_y.shape[1] > 1 else used * self.driven
+
     def rows(self, which: slice | npt.NDArray) -> BinData:
         """Some of the points."""
         u = self.u if len(self.u) < len(self.y) else self.u[which]

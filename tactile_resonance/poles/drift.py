@@ -169,7 +169,7 @@ class DriftingModes:
 
     @cached_property
     def _s(self) -> ComplexArray:
-        return np.asarray(2j * np.pi * self.plan.frequency_hz(self.plan.bins))
+        return np.asarray(2j * np.pi * self.plan.frequency_hz)
 
     @cached_property
     def _lines(self) -> ComplexArray:
@@ -220,7 +220,7 @@ def _linearised(
     """
     plan, u, theta = modes.plan, modes.u, modes.theta
     directions = np.concatenate([modes.directions(row) for row in rows])
-    others = plan.other_bins.size
+    others = plan.others_at.size
     data = BinData.of(y[None, None], u[None, None], plan.order, others)
     if not flat:
         data, *_ = with_noise(plan, data, theta[None, None])
@@ -344,7 +344,7 @@ def _result(modes: DriftingModes, drift: FloatArray, at: _Step) -> Poles:
     added = at.coefficients @ covariance @ at.coefficients.T
     pole = fit.poles_rad_s
     sensitivity = fit.fit.residues_and_sensitivity(pole)[1]
-    more, in_f0 = propagated(pole, sensitivity, added)
+    more, in_f0 = (of[0] for of in propagated(pole[None], sensitivity[None], added[None]))
     fit = replace(
         fit,
         coefficient_covariance=fit.coefficient_covariance + added,

@@ -58,7 +58,8 @@ def poles_of_frf(
     structure : ModelStructure, optional
         One mode and six residual terms when absent.
     method : {"auto", "joint", "frf"}
-        ``auto`` is ``joint`` where the FRF brings bins that cover the band and hold lines enough.
+        ``auto`` is ``joint`` where the FRF brings bins that cover the band and hold lines enough. A joint
+        fit that does not converge is followed by one to the FRF.
 
     Returns
     -------
@@ -87,7 +88,12 @@ def poles_of_frf(
     told = poles.status is PolesStatus.MODEL_ERROR or frf.periods == 1  # a transient is estimated here
     if frf.status is not FrfStatus.OK and not (frf.status is FrfStatus.MODEL_ERROR and told):
         poles = poles.noting(frf.message)
-    return second_attempt(poles, frf, band_hz, structure)
+    if poles.status is not PolesStatus.NOT_CONVERGED:
+        return poles
+    again = identify_frf(frf, band_hz, structure)
+    if again.status not in (PolesStatus.OK, PolesStatus.MODEL_ERROR, PolesStatus.NO_COVARIANCE):
+        return poles.noting(f"from the FRF: {again.status.value}")
+    return again.noting("from the FRF: the joint fit did not converge")
 
 
 def poles_of_bands(frf: FRF, bands: Sequence[PoleBand], method: str = "auto") -> Poles:
@@ -116,28 +122,6 @@ def poles_of_bands(frf: FRF, bands: Sequence[PoleBand], method: str = "auto") ->
 
     first, *further = (of_band(k, band) for k, band in enumerate(bands))
     return replace(first, further=tuple(further))
-
-
-def second_attempt(
-    poles: Poles, frf: FRF, band_hz: tuple[float, float], structure: ModelStructure
-) -> Poles:
-    """Poles from the FRF where the joint fit of the same record did not converge, and says so.
-
-    Parameters
-    ----------
-    poles : Poles
-        From a joint fit; returned as they are unless it did not converge.
-    frf : FRF
-        With (F,) arrays.
-    band_hz : (low, high)
-    structure : ModelStructure
-    """
-    if poles.status is not PolesStatus.NOT_CONVERGED:
-        return poles
-    again = identify_frf(frf, band_hz, structure)
-    if again.status not in (PolesStatus.OK, PolesStatus.MODEL_ERROR, PolesStatus.NO_COVARIANCE):
-        return poles.noting(f"from the FRF: {again.status.value}")
-    return again.noting("from the FRF: the joint fit did not converge")
 
 
 def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelStructure) -> str:
@@ -207,30 +191,24 @@ def identify_poles_from_records(
 
 def identify_poles_from_bins(
     bins: BandBins,
-    band_hz: tuple[float, float] | None = None,
+    band_hz: tuple[float, float],
     structure: ModelStructure | None = None,
-    *,
-    notes: Sequence[str] = (),
 ) -> Poles:
     """Poles from the bins that a stream of periods keeps; plans of the latest kinds are kept.
 
     Parameters
     ----------
     bins : BandBins
-    band_hz : (low, high), optional
-        Within that of the bins, which is taken when absent.
+    band_hz : (low, high)
+        Within that of the bins.
     structure
         See `JointPlan`.
-    notes : sequence of str
-        Added to the message.
 
     Raises
     ------
     ValueError
         If the bins do not cover the band, or as `JointPlan`.
     """
-    if band_hz is None:
-        band_hz = bins.band_hz
     plan = _plan(
         bins.sample_rate_hz,
         bins.samples_per_period,
@@ -249,7 +227,7 @@ def identify_poles_from_bins(
     u, y = bins.u[:, here], bins.y[:, here]
     if u.shape[0] == 1:
         u, y = u[0], y[0]
-    return _of_plan(plan, u, y).noting(*notes)
+    return _of_plan(plan, u, y)
 
 
 def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
@@ -259,7 +237,7 @@ def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
     if poles is not None:
         return poles
     rest, tones = poles_without_tones(plan, u, y, batch)
-    if y.ndim == 1 and plan.periods > 1 and plan.other_bins.size:
+    if y.ndim == 1 and plan.periods > 1 and plan.others_at.size:
         found = poles_with_drift(plan, u, y, batch)
         # a drift fills the bins beside a line as tones would: what leaves less noise is right
         if found is not None and (not tones or found[1] < rest.noise_variance[0]):
@@ -336,7 +314,7 @@ def _poles_with_all_bins(
 
 @np.errstate(all="ignore")  # what exceeds double precision is left to the status of the fit
 def _disturbed(plan: JointPlan, u: ComplexArray) -> bool:
-    if plan.other_bins.size == 0:
+    if plan.others_at.size == 0:
         return False
     power = np.abs(u) ** 2
     lines = np.mean(power[..., plan.excited_at])
@@ -353,7 +331,7 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch, ratio: float) -> flo
 
     Of a fit weighted with another ratio.
     """
-    gain = np.abs(of_all.fit.response(plan.frequency_hz(plan.bins))) ** 2
+    gain = np.abs(of_all.fit.response(plan.frequency_hz)) ** 2
     variance = np.abs(of_all.residual) ** 2 * (1 + ratio * gain)
     curve = two_channels(variance[None], gain[None])[0]
     low, high = np.argmin(gain), np.argmax(gain)
@@ -366,7 +344,7 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch, ratio: float) -> flo
 @np.errstate(all="ignore")  # a fit that failed explains nothing
 def _explained(plan: JointPlan, of_all: PolesBatch, u: ComplexArray) -> float:
     """Mean square of ``G U`` between harmonics over the variance of ``Y - G U``."""
-    g = of_all.fit.response(plan.frequency_hz(plan.other_bins))
+    g = of_all.fit.response(plan.frequency_hz[plan.others_at])
     made = np.mean(np.abs(g * u[..., plan.others_at]) ** 2)
     noise_y, noise_u = of_all.noise_variance
     return float(made / (noise_y + noise_u * np.mean(np.abs(g) ** 2)))

@@ -8,115 +8,30 @@ does not converge, has many poles or a pure delay is fitted by scipy's least squ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.likelihood import ROUNDING, STEP_TOLERANCE, Rules, Solution
 from tactile_resonance.poles.tables import Problem
 
-MAX_ITERATIONS = 60
-# A step below this many standard deviations, as the residuals show them, is the last one taken.
-STEP_TOLERANCE = 1e-2
-# Rounding of a residual relative to the data it is the residual of.
-ROUNDING = 1e-14
+ORDINARY = Rules()
 # Of a fit at full precision.
 LEAST_SQUARES_STARTS = 20
 LEAST_SQUARES_EVALUATIONS = 200
 LEAST_SQUARES_TOLERANCE = 1e-10
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Coefficients of points.
-
-    Attributes
-    ----------
-    theta : (points, M, n) float
-        Coefficients [A without its last, B, C] of each record; A and B are alike in all.
-    cost : (points,) float
-    part_cost : (points, 2) float
-        Of undriven and driven bins.
-    residual : (points, M, K_driven) complex
-        Weighted, turned by the phase of the input.
-    converged : (points,) bool
-    normal : (points, M, 2, n, n) float
-        ``Re J^H J`` of undriven and of driven bins at the solution; of several records alone.
-    marginal : (points, M, n, n) float
-        Blocks of the inverse of the normal matrix: of the coefficients that records share and those of one;
-        NaN where it is singular or not finite.
-    condition : (points,) float
-        See `likelihood.invert`.
-    leverage : (points, 2) float
-        Real coefficients that go to undriven and to driven bins.
-    noise : (points, 2) float
-        Variances of Y and U that undriven bins show; NaN where they were not asked for.
-    plain : (points,) bool
-        False where undriven bins show noise other than flat, or alike in both channels: not fitted yet.
-    """
-
-    theta: FloatArray
-    cost: FloatArray
-    part_cost: FloatArray
-    residual: ComplexArray
-    converged: BoolArray
-    normal: FloatArray
-    marginal: FloatArray
-    condition: FloatArray
-    leverage: FloatArray
-    noise: FloatArray
-    plain: BoolArray
-
-    def rows(self, which: npt.NDArray) -> Solution:
-        """Some of the points."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(Solution)}
-        return replace(self, **{name: x[which] for name, x in arrays.items() if len(x)})
-
-    @classmethod
-    def joined(cls, solutions: Sequence[Solution]) -> Solution:
-        """Of the points of all."""
-        return cls(*(np.concatenate([getattr(s, f.name) for s in solutions]) for f in fields(cls)))
-
-    def put(self, which: npt.NDArray, others: Solution) -> None:
-        """Write other solutions in place of some; what undriven bins show stays as it was found."""
-        for f in fields(Solution):
-            if f.name not in ("noise", "plain") and getattr(self, f.name).size:
-                getattr(self, f.name)[which] = getattr(others, f.name)
-
-    def inverse(self, shared: int) -> FloatArray:
-        """(points, s + M c, s + M c) of the normal matrix of all coefficients; NaN where `marginal` is."""
-        points, records, n = self.theta.shape
-        if records == 1:
-            return self.marginal[:, 0]
-        normal, own = self.normal.sum(axis=2), n - shared
-        whole = np.zeros((points, *2 * [shared + records * own]))
-        whole[:, :shared, :shared] = normal[:, :, :shared, :shared].sum(axis=1)
-        for m in range(records):
-            here = slice(shared + m * own, shared + (m + 1) * own)
-            whole[:, here, :shared] = normal[:, m, shared:, :shared]
-            whole[:, :shared, here] = normal[:, m, :shared, shared:]
-            whole[:, here, here] = normal[:, m, shared:, shared:]
-        return likelihood.invert(whole)[0]
-
-    def sandwich(self, normal: FloatArray, shared: int) -> FloatArray:
-        """(points, s, s) of the shared coefficients, of gradients with covariances (points, M, n, n)."""
-        rows = self.marginal[:, :, :shared]
-        return np.einsum("bmik,bmkl,bmjl->bij", rows, normal, rows)
-
-
-RULES = likelihood.Rules(MAX_ITERATIONS, STEP_TOLERANCE, ROUNDING, 0, 0, 0.0, 0.0)
-
-
 def minimise(
     problem: Problem,
     data: BinData,
     start: FloatArray | None = None,
-    rules: likelihood.Rules = RULES,
+    rules: Rules = ORDINARY,
 ) -> Solution:
     """Minimise the cost of each point.
 
@@ -129,7 +44,7 @@ def minimise(
     rules : Rules
     """
     begin = np.empty((0, data.records, sum(problem.sizes))) if start is None else start
-    return Solution(*likelihood.minimise(problem.tables, data, begin, rules))
+    return likelihood.minimise(problem.tables, data, begin, rules)
 
 
 def refit_failed(problem: Problem, solution: Solution, data: BinData) -> None:
@@ -401,8 +316,13 @@ def linear_step(problem: Problem, data: BinData, size: FloatArray) -> FloatArray
     scale = 1 / (np.sqrt(data.variance[0]) * size)
     design *= scale[..., None]
     target = -y * problem.denominator[:, a] * scale
-    rows = np.stack([design.real, design.imag]).reshape(-1, design.shape[-1])
-    right = np.stack([target.real, target.imag]).ravel()
+    return real_solution(design.reshape(-1, design.shape[-1]), target.ravel())
+
+
+def real_solution(matrix: ComplexArray, right: ComplexArray) -> FloatArray:
+    """Real least squares solution of complex equations, whatever the scales of its unknowns."""
+    rows = np.concatenate([matrix.real, matrix.imag])
+    right = np.concatenate([right.real, right.imag])
     column = np.linalg.norm(rows, axis=0)
     column[~(column > 0)] = 1.0
     if not np.isfinite(rows).all() or not np.isfinite(right).all():

@@ -228,7 +228,7 @@ def _identify(
         # bases need points: any will do, nothing is fitted
         places = max(structure.order, structure.numerator_order) + 1
         plan = LinesPlan.on_lines(np.linspace(1.0, 2.0, places), structure, band_hz)
-        judged = _nothing(plan, used)
+        judged = Judged.of(plan, np.minimum(used, structure.fewest_lines - 1))
     else:
         plan, judged = _judged(LinesPlan.on_lines(frequency_hz, structure, band_hz), lines, used)
     return assemble(
@@ -291,27 +291,6 @@ def _judged(
         dispensable=of_fit.dispensable(lines.data, fit),
     )
     return of_fit, judged
-
-
-def _nothing(plan: LinesPlan, used: IntArray) -> Judged:
-    """Of too few lines: NaN."""
-    batch, parameters = used.size, plan.structure.parameters
-    nan, no = np.full(batch, np.nan), np.zeros(batch, bool)
-    matrix = np.full((batch, parameters, parameters), np.nan)
-    return Judged.of(
-        plan,
-        np.minimum(used, plan.structure.fewest_lines - 1),
-        theta=np.full((batch, parameters), np.nan),
-        condition_number=nan,
-        converged=no,
-        residual=np.zeros((batch, 0), complex),
-        cost=nan,
-        expected_cost=nan,
-        suspect=no,
-        covariance=matrix,
-        total=matrix,
-        kind=np.full(batch, -1),
-    )
 
 
 def with_transient_judged(frf: FRF, poles: Poles) -> Poles:

@@ -24,17 +24,11 @@ import numpy.typing as npt
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.poles.basis import (
-    PolynomialBasis,
-    default_transient_terms,
-    transient_basis,
-)
+from tactile_resonance.poles.basis import default_transient_terms, transient_basis
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint_fit import fit_records
 from tactile_resonance.poles.judgement import assemble
-from tactile_resonance.poles.lacking import Directions
-from tactile_resonance.poles.model import Variable
 from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.starts import best_of_split
@@ -94,8 +88,23 @@ class JointPlan(FitPlan):
     left_out: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        self._check()
-        lines, fewest = self.excited_bins.size, self.structure.fewest_lines
+        for name in ("samples_per_period", "periods", "transient_terms"):
+            value = getattr(self, name)
+            if not (name == "transient_terms" and value is None):
+                good = isinstance(value, Integral) and int(value) >= 1
+                require(good, name, value, "a whole number, at least 1")
+        rate_hz = number(self.sample_rate_hz, "sample_rate_hz")
+        require(rate_hz > 0, "sample_rate_hz", rate_hz, "a number above 0")
+        band(self.band_hz, most_hz=rate_hz / 2)
+        require_kind(self.structure, "structure", ModelStructure)
+        if self.structure.domain == "z":
+            of_model = self.structure.sample_rate_hz
+            accepted = f"that of the record, {rate_hz:g} Hz"
+            require(of_model == rate_hz, "structure.sample_rate_hz", of_model, accepted)
+        if self.input_noise_ratio is not None:
+            ratio = number(self.input_noise_ratio, "input_noise_ratio")
+            require(ratio >= 0, "input_noise_ratio", ratio, "a number, 0 or above")
+        lines, fewest = self.excited_at.size, self.structure.fewest_lines
         if lines <= fewest:
             raise ValueError(
                 f"band_hz: {self.band_hz} holds {lines} excited lines, "
@@ -174,13 +183,12 @@ class JointPlan(FitPlan):
         if u.shape == y.shape:
             return u, y
         try:
-            shape = np.broadcast_shapes(u.shape[:-1], y.shape[:-1])
+            u, y = np.broadcast_arrays(u, y)
         except ValueError:
             raise ValueError(
                 f"y: shape {y.shape}, expected leading axes like those of u, {u.shape}"
             ) from None
-        whole = (*shape, self.bins.size)
-        return np.broadcast_to(u, whole), np.broadcast_to(y, whole)
+        return u, y
 
     @cached_property
     def bins(self) -> IntArray:
@@ -211,44 +219,15 @@ class JointPlan(FitPlan):
         """(K_o,) places of the bins that show transient and noise alone."""
         return np.flatnonzero(self._between & self._kept)
 
-    @property
-    def excited_bins(self) -> IntArray:
-        """(K_e,) of the DFT of the whole record."""
-        return self.bins[self.excited_at]
-
-    @property
-    def other_bins(self) -> IntArray:
-        """(K_o,)."""
-        return self.bins[self.others_at]
-
     @cached_property
     def order(self) -> IntArray:
         """Places of the bins of `problem` among all: the others first, then the excited ones."""
         return np.append(self.others_at, self.excited_at)
 
     @cached_property
-    def variable(self) -> Variable:
-        """Of the polynomials."""
-        return Variable.for_lines(self.frequency_hz(self.bins), self.structure)
-
-    @cached_property
-    def _x(self) -> ComplexArray:
-        return self.variable.of_frequency(self.frequency_hz(self.bins))
-
-    @cached_property
-    def denominator_basis(self) -> PolynomialBasis:
-        """Orthonormal on all bins."""
-        return PolynomialBasis.on_lines(self._x, self.structure.order)
-
-    @cached_property
-    def numerator_basis(self) -> PolynomialBasis:
-        """Orthonormal on the excited bins."""
-        return PolynomialBasis.on_lines(self._x[self.excited_at], self.structure.numerator_order)
-
-    @cached_property
     def numerator_on_bins(self) -> ComplexArray:
         """(K, b) values of `numerator_basis` on all bins."""
-        return self.numerator_basis.at(self._x, 0)[0]
+        return self.numerator_basis.at(self.x, 0)[0]
 
     @cached_property
     def transient_on_bins(self) -> ComplexArray:
@@ -257,7 +236,7 @@ class JointPlan(FitPlan):
         if terms is None:
             terms = default_transient_terms(self.structure)
         return transient_basis(
-            self.frequency_hz(self.bins), terms, self.sample_rate_hz, self.band_hz, self.structure
+            self.frequency_hz, terms, self.sample_rate_hz, self.band_hz, self.structure
         )
 
     @cached_property
@@ -272,7 +251,7 @@ class JointPlan(FitPlan):
     @property
     def level_known(self) -> bool:
         """Whether the noise of one record is known from more than the residuals."""
-        return self.other_bins.size > 0 or self.input_noise_ratio is not None
+        return self.others_at.size > 0 or self.input_noise_ratio is not None
 
     def with_structure(self, structure: ModelStructure) -> JointPlan | None:
         """The plan of another structure; None where the band holds too few lines for it."""
@@ -286,24 +265,10 @@ class JointPlan(FitPlan):
         """Spacing of the bins: one over the duration of the record."""
         return self.sample_rate_hz / (self.samples_per_period * self.periods)
 
-    def frequency_hz(self, bins: IntArray) -> FloatArray:
-        """Of bins."""
-        return np.asarray(bins * self.resolution_hz, float)
-
     @cached_property
-    def directions(self) -> Directions:
-        """What a richer model has in addition, on the driven bins."""
-        x = self._x[self.excited_at]
-        return Directions.on_lines(
-            self.frequency_hz(self.excited_bins), x, self.structure.numerator_order
-        )
-
-    @cached_property
-    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Bases of A, B and C on the driven bins."""
-        at = self.excited_at
-        of_a, of_c = self.denominator_basis.values[at], self.transient_on_bins[at]
-        return of_a, self.numerator_basis.values, of_c
+    def frequency_hz(self) -> FloatArray:
+        """(K,) of all bins."""
+        return np.asarray(self.bins * self.resolution_hz, float)
 
     def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
         """Poles of a fit, in the band or not, and their covariance as its residuals show it."""
@@ -320,24 +285,6 @@ class JointPlan(FitPlan):
     def _between(self) -> BoolArray:
         """(K,) which bins show transient and noise alone."""
         return ~self.driven
-
-    def _check(self) -> None:
-        for name in ("samples_per_period", "periods", "transient_terms"):
-            value = getattr(self, name)
-            if not (name == "transient_terms" and value is None):
-                good = isinstance(value, Integral) and int(value) >= 1
-                require(good, name, value, "a whole number, at least 1")
-        rate_hz = number(self.sample_rate_hz, "sample_rate_hz")
-        require(rate_hz > 0, "sample_rate_hz", rate_hz, "a number above 0")
-        band(self.band_hz, most_hz=rate_hz / 2)
-        require_kind(self.structure, "structure", ModelStructure)
-        if self.structure.domain == "z":
-            of_model = self.structure.sample_rate_hz
-            accepted = f"that of the record, {rate_hz:g} Hz"
-            require(of_model == rate_hz, "structure.sample_rate_hz", of_model, accepted)
-        if self.input_noise_ratio is not None:
-            ratio = number(self.input_noise_ratio, "input_noise_ratio")
-            require(ratio >= 0, "input_noise_ratio", ratio, "a number, 0 or above")
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,7 +346,7 @@ class PoleEstimator(JointPlan):
 
     @cached_property
     def _single(self) -> JointPlan:
-        return JointPlan(*(getattr(self, f.name) for f in fields(self) if f.init))
+        return JointPlan(*(getattr(self, f.name) for f in fields(self)))
 
     @property
     def _between(self) -> BoolArray:

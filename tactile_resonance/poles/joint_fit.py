@@ -17,12 +17,12 @@ import numpy as np
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.realisations import Agreement
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import Solution, minimise, refit_failed
+from tactile_resonance.poles.fit import minimise, refit_failed
 from tactile_resonance.poles.joint_noise import TINY, rules_between, with_noise
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
 from tactile_resonance.poles.levels import Level, Levels, line_pieces, smooth_variance
-from tactile_resonance.poles.likelihood import moments
+from tactile_resonance.poles.likelihood import Solution, moments
 from tactile_resonance.poles.model_error import systematic_of
 from tactile_resonance.poles.noise_level import Pieces, are_flat
 from tactile_resonance.poles.realisations_spread import Spread
@@ -125,9 +125,9 @@ class _Round:
 
         Of a wrong fit the transients hold part of what realisations differ by; those of a right one hide some.
         """
-        problem, driven, data = self.plan.problem, slice(self.data.undriven, None), self.data
-        alpha, _, gamma = problem.split(self.solution.theta)
-        transient = (gamma @ problem.transient[driven].T) / (alpha @ problem.denominator[driven].T)
+        problem, data = self.plan.problem, self.data
+        (alpha, _, gamma), (of_a, _, of_c) = problem.split(self.solution.theta), problem.driven_bases
+        transient = (gamma @ of_c.T) / (alpha @ of_a.T)
         with np.errstate(divide="ignore", invalid="ignore"):
             return data.y_driven / data.u_driven, (data.y_driven - transient) / data.u_driven
 

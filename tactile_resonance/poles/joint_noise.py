@@ -13,7 +13,6 @@ import numpy as np
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import RULES
 from tactile_resonance.poles.likelihood import FEWEST_PIECES, TINY, Rules
 from tactile_resonance.poles.noise_level import (
     FALSE_ALARM,
@@ -44,7 +43,7 @@ def pieces_between(bins: int, records: int) -> Pieces:
 def rules_between(bins: int, records: int) -> Rules:
     """Of fits that find the noise on so many bins themselves, where it is flat."""
     pieces = pieces_between(bins, records)
-    return RULES._replace(
+    return Rules(
         pieces=pieces.starts.size,
         size=pieces.size,
         chance=correlation_limit(bins * records),
@@ -111,7 +110,7 @@ def with_noise(
         y = data.y.copy()
         y[..., others] -= through.reshape(len(y), -1, records).swapaxes(1, 2)
         data = data._replace(y=y)
-    before = np.searchsorted(plan.other_bins, plan.excited_bins)
+    before = np.searchsorted(plan.others_at, plan.excited_at)
     of_excited = pieces.of_bin[np.minimum(before, data.undriven - 1)]
     weighted = data.weighted(
         rest=_on(pieces.of_bin, np.where(rest_power > TINY, rest_power, 1.0)),

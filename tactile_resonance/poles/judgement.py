@@ -103,9 +103,18 @@ class Judged:
 
     @classmethod
     def of(cls, plan: FitPlan, lines: IntArray, **values: Any) -> Judged:
-        """With a known level of noise, and nothing to remark, of what no value is given for."""
-        batch, places = lines.size, plan.structure.order // 2
-        nothing: dict[str, tuple[tuple[int, ...], float | bool]] = {
+        """With a known level of noise, and nothing found or to remark, of what no value is given for."""
+        batch, parameters, places = lines.size, plan.structure.parameters, plan.structure.order // 2
+        nothing: dict[str, tuple[tuple[int, ...], complex]] = {
+            "theta": ((batch, parameters), np.nan),
+            "condition_number": ((batch,), np.nan),
+            "converged": ((batch,), False),
+            "residual": ((batch, 0), 0j),
+            "cost": ((batch,), np.nan),
+            "expected_cost": ((batch,), np.nan),
+            "suspect": ((batch,), False),
+            "covariance": ((batch, parameters, parameters), np.nan),
+            "kind": ((batch,), -1),
             "level_known": ((batch,), True),
             "noise_variance": ((batch, 2), np.nan),
             "systematic": ((batch, places, 2, 2), 0.0),
@@ -114,6 +123,7 @@ class Judged:
         }
         for name in nothing.keys() - values.keys():
             values[name] = np.full(*nothing[name])
+        values.setdefault("total", None)
         values.setdefault("doubt", np.full(batch, None, object))
         values.setdefault("remark", np.full(batch, "", object))
         return cls(lines=lines, **values)

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import Solution
+from tactile_resonance.poles.likelihood import Solution
 from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
@@ -154,6 +154,7 @@ class Lack:
     doubt: npt.NDArray[np.object_]
 
     @classmethod
+    @np.errstate(all="ignore")
     def of(
         cls,
         plan: FitPlan,
@@ -171,14 +172,50 @@ class Lack:
         asked : (batch,) bool
         least : (batch,) float, optional
             Of the level of the noise over that weighted with, where it is known beforehand; 0 when absent.
+
+        Notes
+        -----
+        The level of the noise is what the residuals of all bins have besides that direction, so that each
+        direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
+        exceeded by chance with ``(1 - R)^(dof - 1)``.
         """
         batch, rows = asked.size, asked.nonzero()[0]
         lack = cls(np.full((batch, 3), np.nan), np.zeros(batch), np.full(batch, None, object))
-        if rows.size:
-            if rows.size < batch:
-                data, solution = data.rows(rows), solution.rows(rows)
-            known = None if least is None else least[rows]
-            lack._search(rows, plan, data, solution, known)
+        if not rows.size:
+            return lack
+        if rows.size < batch:
+            data, solution = data.rows(rows), solution.rows(rows)
+        known = np.full(rows.size, -np.inf) if least is None else least[rows]
+        directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
+        cost = solution.cost
+        dof = data.records * (data.undriven + data.lines) - inverse.shape[-1] / 2  # (batch,)
+        rest, modes = np.maximum(dof - 1, 0.5), directions.modes
+        fall, doubted, striking, taken, left = _falls(
+            *(data, plan.problem.driven_bases, solution.theta, inverse, directions.numerator, modes),
+            *(cost, 1 / rest),
+        )
+        enough = dof > FEWEST_DOF
+        for k in (striking & enough).nonzero()[0]:
+            level = np.maximum((cost[k] - fall[k]) / rest[k], known[k])
+            chance = -rest[k] * np.log1p(fall[k] / (rest[k] * level))
+            chance[np.isnan(chance)] = 0.0
+            chance[1:] += math.log(max(len(modes), 1))
+            best = int(np.argmin(chance))
+            if chance[best] < math.log(FALSE_ALARM):
+                f0_hz = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi) if best else np.nan
+                lack.found[rows[k]] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
+        some = (doubted & enough).nonzero()[0]
+        if some.size:
+            of_terms = fall[some, 0]
+            level = np.maximum((cost[some] - of_terms) / rest[some], known[some])
+            likely = rest[some] * np.log1p(of_terms / (rest[some] * level)) > -math.log(DOUBT)
+            some, level, of_terms = some[likely], level[likely], of_terms[likely]
+            own, moved = left[some, :, :2], inverse[some] @ taken[some].swapaxes(1, 2)  # (r, n, 2)
+            size = np.linalg.solve(own, left[some, :, 2:])  # (r, 2, 1) of the two terms
+            moment = 0.5 * level[:, None, None] * np.linalg.inv(own) + size * size.swapaxes(1, 2)
+            lack.chi_square[rows[some]] = 2 * of_terms / level
+            for k, matrix in zip(rows[some], moved @ moment @ moved.swapaxes(1, 2), strict=True):
+                lack.doubt[k] = matrix
         return lack
 
     def only_where(self, sound: BoolArray) -> Lack:
@@ -199,64 +236,6 @@ class Lack:
                 "modes outside the band matter: the covariance includes what they move the poles by"
             )
         return said
-
-    @np.errstate(all="ignore")
-    def _search(
-        self,
-        rows: IntArray,
-        plan: FitPlan,
-        data: BinData,
-        solution: Solution,
-        least: FloatArray | None,
-    ) -> None:
-        """Fill in points, whose data and fits these are.
-
-        Notes
-        -----
-        The level of the noise is what the residuals of all bins have besides that direction, so that each
-        direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
-        exceeded by chance with ``(1 - R)^(dof - 1)``.
-        """
-        directions, inverse = plan.directions, solution.inverse(sum(plan.problem.sizes[:2]))
-        variance, cost = data.variance_y, solution.cost
-        used = np.full(cost.size, data.driven)
-        if variance.shape[1] > 1:
-            used = np.isfinite(variance).sum(axis=1)
-        dof = data.records * (data.undriven + used) - inverse.shape[-1] / 2  # (batch,)
-        rest, modes = np.maximum(dof - 1, 0.5), directions.modes
-        fall, doubted, asked, taken, left = _falls(
-            *(data, plan.driven_bases, solution.theta, inverse, directions.numerator, modes),
-            *(cost, 1 / rest),
-        )
-        enough = dof > FEWEST_DOF
-        for k in (asked & enough).nonzero()[0]:
-            level = _level(cost[k] - fall[k], rest[k], least, k)
-            chance = -rest[k] * np.log1p(fall[k] / (rest[k] * level))
-            chance[np.isnan(chance)] = 0.0
-            chance[1:] += math.log(max(len(modes), 1))
-            best = int(np.argmin(chance))
-            if chance[best] < math.log(FALSE_ALARM):
-                f0_hz = np.abs(directions.poles_rad_s[best - 1]) / (2 * np.pi) if best else np.nan
-                self.found[rows[k]] = 2 * fall[k, best] / level[best], 4.0 if best else 2.0, f0_hz
-        some = (doubted & enough).nonzero()[0]
-        if some.size:
-            level, of_terms = _level((cost - fall[:, 0])[some], rest[some], least, some), fall[some, 0]
-            likely = rest[some] * np.log1p(of_terms / (rest[some] * level)) > -math.log(DOUBT)
-            some, level, of_terms = some[likely], level[likely], of_terms[likely]
-            own, moved = left[some, :, :2], inverse[some] @ taken[some].swapaxes(1, 2)  # (r, n, 2)
-            size = np.linalg.solve(own, left[some, :, 2:])  # (r, 2, 1) of the two terms
-            moment = 0.5 * level[:, None, None] * np.linalg.inv(own) + size * size.swapaxes(1, 2)
-            self.chi_square[rows[some]] = 2 * of_terms / level
-            for k, matrix in zip(rows[some], moved @ moment @ moved.swapaxes(1, 2), strict=True):
-                self.doubt[k] = matrix
-
-
-def _level(
-    left: FloatArray, rest: FloatArray, least: FloatArray | None, which: IntArray
-) -> FloatArray:
-    """Of the noise, from the cost that is left, where it is not known to be higher."""
-    level = left / rest
-    return level if least is None else np.maximum(level, least[which])
 
 
 @entry

@@ -16,9 +16,8 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.fit import Solution
 from tactile_resonance.poles.joint_noise import BINS_PER_BAND
-from tactile_resonance.poles.likelihood import invert
+from tactile_resonance.poles.likelihood import Solution, invert
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.noise_level import (
     Pieces,
@@ -112,34 +111,6 @@ class Level:
         return cls(scale, cost, expected, suspect, noise * level[:, None], correction)
 
 
-def common_and_differing(
-    residual: ComplexArray, u: ComplexArray
-) -> tuple[ComplexArray, FloatArray]:
-    """What weighted residuals of M realisations have in common, and the power of what they differ by.
-
-    Parameters
-    ----------
-    residual : (batch, M, K) complex
-        Turned by the phases of the inputs.
-    u : (batch, M, K) complex
-        Inputs.
-
-    Returns
-    -------
-    common : (batch, K) complex
-        Of the variance of one residual. 0 on lines without input.
-    differing : (batch, K) float
-        With M - 1 degrees of freedom a line.
-    """
-    size = np.abs(u)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        whole = np.sqrt(np.sum(size**2, axis=1, keepdims=True))
-        direction = np.where(whole > 0, size / whole, 0.0)
-    common = np.einsum("bmk,bmk->bk", direction, residual)
-    differing = residual - direction * common[:, None]
-    return common, np.sum(differing.real**2 + differing.imag**2, axis=1)
-
-
 def line_pieces(lines: int, dof: int) -> Pieces:
     """Pieces of lines with a sample variance of `dof` degrees of freedom each."""
     size = min(-(-PIECE_DOF // dof), max(1, lines // WANTED_PIECES))
@@ -179,7 +150,8 @@ class Levels:
     Attributes
     ----------
     common : (batch, K_e) complex
-        Of weighted residuals; see `common_and_differing`.
+        What weighted residuals of realisations have in common, with the variance of one residual; 0 on lines
+        without input.
     between : (batch,) float
         From the bins between harmonics: noise; NaN where there are none.
     between_dof : (batch,) float
@@ -241,7 +213,13 @@ class Levels:
             Where that variance is from each of the pieces alone.
         """
         batch, records, lines = solution.residual.shape
-        common, differing = common_and_differing(solution.residual, u)
+        size = np.abs(u)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            whole = np.sqrt(np.sum(size**2, axis=1, keepdims=True))
+            direction = np.where(whole > 0, size / whole, 0.0)
+        common = np.einsum("bmk,bmk->bk", direction, solution.residual)
+        rest = solution.residual - direction * common[:, None]
+        differing = np.sum(rest.real**2 + rest.imag**2, axis=1)  # M - 1 degrees of freedom a line
         common_cost = np.sum(common.real**2 + common.imag**2, axis=-1)
         used_between, used = solution.leverage.T
         # what the transients take from a line: of each a part 1/M of what all have in common
@@ -352,11 +330,8 @@ def _taken_by_transients(plan: JointPlan, solution: Solution, variance: FloatArr
     there.
     """
     a, b, own = plan.problem.sizes
-    problem = plan.problem
-    driven = slice(problem.undriven, None)
-    alpha, _, _ = plan.problem.split(solution.theta[:, 0])
-    size = alpha @ problem.denominator[driven].T
-    basis = problem.transient[driven]
+    of_a, _, basis = plan.problem.driven_bases
+    size = plan.problem.split(solution.theta[:, 0])[0] @ of_a.T
     blocks = solution.normal[..., a + b :, a + b :].sum(axis=2)
     inverse = invert(blocks.reshape(-1, own, own))[0].reshape(blocks.shape).sum(axis=1)
     products = np.real(basis.conj()[:, :, None] * basis[:, None, :]).reshape(-1, own * own)

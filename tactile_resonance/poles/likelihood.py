@@ -22,11 +22,13 @@ for all of them; each goes its own way.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from tactile_resonance._typing import FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.compiled import entry, inner
 
 BLOCK = 48
@@ -66,6 +68,10 @@ EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
 TINY = float(np.finfo(float).tiny)
 MOST_INVERTED = 1 / float(np.finfo(float).eps)
 """Condition of a matrix of which rounding leaves nothing of the inverse."""
+# The last step is one that the next one would be so many standard deviations of, as the residuals show them.
+STEP_TOLERANCE = 1e-2
+# Rounding of a residual relative to the data it is the residual of.
+ROUNDING = 1e-14
 MOST_DAMPING = 1e10
 LEAST_DAMPING = 1e-3
 # A step is the last one, too, where the next one would be smaller than the tolerance by this factor, should
@@ -82,10 +88,6 @@ class Rules(NamedTuple):
     ----------
     iterations : int
         Most steps tried.
-    tolerance : float
-        Of the last step: so many standard deviations, as the residuals show them, would be the next one.
-    rounding : float
-        Of a residual relative to the data it is the residual of.
     pieces, size : int
         Of the undriven bins: how many pieces, of how many bins, the last one longer. With no piece the data
         bring their variances; else their undriven bins show them, where these are flat noise.
@@ -96,13 +98,88 @@ class Rules(NamedTuple):
         Largest ``log mean - mean log`` of the variances of pieces that is flat.
     """
 
-    iterations: int
-    tolerance: float
-    rounding: float
-    pieces: int
-    size: int
-    chance: float
-    flat: float
+    iterations: int = 60
+    pieces: int = 0
+    size: int = 0
+    chance: float = 0.0
+    flat: float = 0.0
+
+
+class Solution(NamedTuple):
+    """Coefficients of points.
+
+    Attributes
+    ----------
+    theta : (points, M, n) float
+        Coefficients [A without its last, B, C] of each record; A and B are alike in all.
+    cost : (points,) float
+    part_cost : (points, 2) float
+        Of undriven and driven bins.
+    residual : (points, M, K_driven) complex
+        Weighted errors, turned by the phase of the input: errors of a response are smooth over lines,
+        those of Y only after this, for the phases of the excitation are random.
+    converged : (points,) bool
+    normal : (points, M, 2, n, n) float
+        ``Re J^H J`` of undriven and of driven bins, where the last step began; empty of single records.
+    marginal : (points, M, n, n) float
+        Blocks of the inverse of the normal matrix: of the coefficients that records share and those of one;
+        NaN where it is singular or not finite.
+    condition : (points,) float
+        See `invert`.
+    leverage : (points, 2) float
+        Real coefficients that go to undriven and to driven bins.
+    noise : (points, 2) float
+        Variances of Y and U that undriven bins show; NaN where they were not asked for.
+    plain : (points,) bool
+        False where undriven bins show noise other than flat, or alike in both channels: not fitted yet.
+    """
+
+    theta: FloatArray
+    cost: FloatArray
+    part_cost: FloatArray
+    residual: ComplexArray
+    converged: BoolArray
+    normal: FloatArray
+    marginal: FloatArray
+    condition: FloatArray
+    leverage: FloatArray
+    noise: FloatArray
+    plain: BoolArray
+
+    def rows(self, which: npt.NDArray) -> Solution:
+        """Some of the points."""
+        return Solution._make(x[which] if len(x) else x for x in self)
+
+    @classmethod
+    def joined(cls, solutions: Sequence[Solution]) -> Solution:
+        """Of the points of all."""
+        return cls(*(np.concatenate(arrays) for arrays in zip(*solutions, strict=True)))
+
+    def put(self, which: npt.NDArray, others: Solution) -> None:
+        """Write other solutions in place of some; what undriven bins show stays as it was found."""
+        for name, here, there in zip(self._fields, self, others, strict=True):
+            if name not in ("noise", "plain") and here.size:
+                here[which] = there
+
+    def inverse(self, shared: int) -> FloatArray:
+        """(points, s + M c, s + M c) of the normal matrix of all coefficients; NaN where `marginal` is."""
+        points, records, n = self.theta.shape
+        if records == 1:
+            return self.marginal[:, 0]
+        normal, own = self.normal.sum(axis=2), n - shared
+        whole = np.zeros((points, *2 * [shared + records * own]))
+        whole[:, :shared, :shared] = normal[:, :, :shared, :shared].sum(axis=1)
+        for m in range(records):
+            here = slice(shared + m * own, shared + (m + 1) * own)
+            whole[:, here, :shared] = normal[:, m, shared:, :shared]
+            whole[:, :shared, here] = normal[:, m, :shared, shared:]
+            whole[:, here, here] = normal[:, m, shared:, shared:]
+        return invert(whole)[0]
+
+    def sandwich(self, normal: FloatArray, shared: int) -> FloatArray:
+        """(points, s, s) of the shared coefficients, of gradients with covariances (points, M, n, n)."""
+        rows = self.marginal[:, :, :shared]
+        return np.einsum("bmik,bmkl,bmjl->bij", rows, normal, rows)
 
 
 class _Work(NamedTuple):
@@ -218,20 +295,15 @@ def _load_noise(data, point, before, values):
     driven = data.order.size - data.undriven
     _fill(values[before:], VARIANCE_Y, data.variance_y[point], driven)
     _fill(values[before:], VARIANCE_U, data.variance_u[point], driven)
-    if both.size > 0:
-        for k in range(driven):
-            at, value = k % BLOCK, both[min(k, both.size - 1)]
-            of = values[before + k // BLOCK]
-            of[COVARIANCE * BLOCK + at], of[(COVARIANCE + 1) * BLOCK + at] = value.real, value.imag
+    _fill(values[before:], COVARIANCE, both.real, driven)
+    _fill(values[before:], COVARIANCE + 1, both.imag, driven)
 
 
 @inner
 def _fill(values, row, entries, bins):
     """A row of blocks, of entries for each of the bins, of one for all, or of none."""
     if entries.size == 1:
-        for block in range(values.shape[0]):
-            for k in range(BLOCK):
-                values[block, row * BLOCK + k] = entries[0]
+        values[:, row * BLOCK : (row + 1) * BLOCK] = entries[0]
     elif entries.size > 1:
         for k in range(bins):
             values[k // BLOCK, row * BLOCK + k % BLOCK] = entries[k]
@@ -482,18 +554,16 @@ def _solve(work, which, c, damping):
 def _inside(theta, point, c, at, g):
     """Coefficients in the order C, A, B from [A, B, C]."""
     n = theta.shape[2]
-    for m in range(theta.shape[1]):
-        for i in range(n):
-            at[g, m, i] = theta[point, m, i + n - c if i < c else i - c]
+    at[g, :, :c] = theta[point, :, n - c :]
+    at[g, :, c:n] = theta[point, :, : n - c]
 
 
 @inner
 def _outside(at, g, c, theta, point):
     """Coefficients in the order [A, B, C] from C, A, B."""
     n = theta.shape[2]
-    for m in range(theta.shape[1]):
-        for i in range(n):
-            theta[point, m, i + n - c if i < c else i - c] = at[g, m, i]
+    theta[point, :, n - c :] = at[g, :, :c]
+    theta[point, :, : n - c] = at[g, :, c:n]
 
 
 @inner
@@ -568,30 +638,15 @@ def _start(tables, work, which):
 
 
 @inner
-def _take(at, g, step, to):
-    """Coefficients of a point less a step."""
-    for m in range(step.shape[0]):
-        for i in range(step.shape[1]):
-            to[g, m, i] = at[g, m, i] - step[m, i, g]
-
-
-@inner
 def _weight_with(values, gram, cost, g, before, variance_y, variance_u):
     """Flat variances, in memory and in what sums there are of undriven bins."""
     factor = 1 / variance_y
     change = factor / values[g, 0, 0, INVERSE * BLOCK]
-    for m in range(gram.shape[1]):
-        for i in range(gram.shape[3]):
-            gram[g, m, 0, i] *= change
+    gram[g, :, 0] *= change
     cost[g, 0] *= change
-    for m in range(gram.shape[1]):
-        for block in range(values.shape[2]):
-            of, driven = values[g, m, block], block >= before
-            for k in range(BLOCK):
-                of[INVERSE * BLOCK + k] = variance_y if driven else factor
-            if driven:
-                for k in range(BLOCK):
-                    of[VARIANCE_U * BLOCK + k] = variance_u
+    values[g, :, :before, INVERSE * BLOCK : (INVERSE + 1) * BLOCK] = factor
+    values[g, :, before:, VARIANCE_Y * BLOCK : (VARIANCE_Y + 1) * BLOCK] = variance_y
+    values[g, :, before:, VARIANCE_U * BLOCK : (VARIANCE_U + 1) * BLOCK] = variance_u
 
 
 @inner
@@ -628,7 +683,7 @@ def _from_noise(tables, work, which, rules, noise, plain, last_fall):
     `last_fall` (G,), what the step was expected to bring.
     """
     records, before = work.at.shape[1], tables.undriven.last.shape[0]
-    bins, c = tables.undriven.bins, tables.c
+    bins, c, n = tables.undriven.bins, tables.c, work.step.shape[1]
     values, sums = records * bins, np.empty(rules.pieces)
     for last in (False, True):
         _sums(tables, 0, work, which, work.at, EXACT, work.gram, work.cost)
@@ -658,7 +713,7 @@ def _from_noise(tables, work, which, rules, noise, plain, last_fall):
             _solve(work, which, c, np.zeros(work.fall.size))
             for g in which:
                 if np.isfinite(work.fall[g]):
-                    _take(work.at, g, work.step, work.at)
+                    work.at[g, :, :n] -= work.step[:, :, g]
                     last_fall[g] = work.fall[g]
 
 
@@ -699,12 +754,12 @@ def _descend(tables, work, which, rules, last_fall, total, converged):
     """
     c, n = tables.c, tables.a + tables.b + tables.c
     records, bins = work.at.shape[1], tables.undriven.bins + tables.driven.bins
-    tolerance = rules.tolerance**2 / max(records * (2 * bins - c) - (n - c), 1)
+    tolerance = STEP_TOLERANCE**2 / max(records * (2 * bins - c) - (n - c), 1)
     damping, floor = np.zeros(work.fall.size), np.zeros(work.fall.size)
     for g in which:
         total[g], converged[g] = work.cost[g, 0] + work.cost[g, 1], False
         power = _weighted_power(work.values[g], tables.undriven.last.shape[0])
-        floor[g] = rules.rounding**2 * power
+        floor[g] = ROUNDING**2 * power
     which = which.copy()
     count = which.size
     for _ in range(rules.iterations):
@@ -718,13 +773,13 @@ def _descend(tables, work, which, rules, last_fall, total, converged):
                 fall <= max(tolerance * total[g], floor[g])
                 or fall * fall <= SURELY**2 * tolerance * total[g] * last_fall[g]
             ):
-                _take(work.at, g, work.step, work.at)
+                work.at[g, :, :n] -= work.step[:, :, g]
                 _expect(work.gram, g, work.step, work.cost)
                 total[g] = work.cost[g, 0] + work.cost[g, 1]
                 converged[g] = True
                 continue
             last_fall[g] = fall if damping[g] == 0 else 0.0
-            _take(work.at, g, work.step, work.trial)
+            work.trial[g, :, :n] = work.at[g, :, :n] - work.step[:, :, g]
             if not np.isfinite(fall):
                 work.trial[g, 0, 0] = np.nan
             which[left] = g
@@ -881,26 +936,7 @@ def minimise(tables, data, start, rules):
 
     Returns
     -------
-    theta : (points, M, n) float
-    cost : (points,) float
-    part_cost : (points, 2) float
-        Of undriven and driven bins.
-    residual : (points, M, K_driven) complex
-        Weighted errors, turned by the phase of the input: errors of a response are smooth over lines,
-        those of Y only after this, for the phases of the excitation are random.
-    converged : (points,) bool
-    normal : (points, M, 2, n, n) float
-        Of undriven and of driven bins, where the last step began; empty of single records.
-    marginal : (points, M, n, n) float
-        Blocks of its inverse, of what records share and what belongs to one; NaN where there is none.
-    condition : (points,) float
-        See `invert`.
-    leverage : (points, 2) float
-        Real coefficients that go to undriven and to driven bins.
-    noise : (points, 2) float
-        Variances of Y and U that undriven bins show, where `rules` ask for them.
-    plain : (points,) bool
-        Whether these are all there is to the noise; others are left where it was found.
+    Solution
     """
     points, records = data.y.shape[:2]
     c, n = tables.c, tables.a + tables.b + tables.c
@@ -940,5 +976,6 @@ def minimise(tables, data, start, rules):
             )
             if records > 1:
                 _unpacked(work.gram, g, c, normal, point)
-    of_fit = (theta, cost, part_cost, residual, converged, normal)
-    return of_fit + (marginal, condition, leverage, noise, plain)
+    return Solution(
+        theta, cost, part_cost, residual, converged, normal, marginal, condition, leverage, noise, plain
+    )

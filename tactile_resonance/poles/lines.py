@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +35,7 @@ def checked_frf(frf: FRF) -> FRF:
         raise ValueError(
             f"frf.g: shape {g.shape}, expected (..., {frequency_hz.size}), one for each line"
         )
-    variances: dict[str, FloatArray | None] = {}
+    variances: dict[str, Any] = {}
     for name, dof_name in (("variance_noise", "noise_dof"), ("variance_total", "total_dof")):
         variance = variances[name] = getattr(frf, name)
         if variance is None:
@@ -46,13 +47,7 @@ def checked_frf(frf: FRF) -> FRF:
                 f"frf.{name}: shape {np.shape(variance)}, expected that of g, {g.shape}"
             ) from None
         _check_dof(getattr(frf, dof_name), f"frf.{dof_name}")
-    return replace(
-        frf,
-        frequency_hz=frequency_hz,
-        g=g,
-        variance_noise=variances["variance_noise"],
-        variance_total=variances["variance_total"],
-    )
+    return replace(frf, frequency_hz=frequency_hz, g=g, **variances)
 
 
 def checked_spectra(

@@ -14,19 +14,16 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
-from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
-    RULES,
     DenseSolution,
     Linearised,
-    Solution,
     least_squares,
     linear_step,
     minimise,
 )
-from tactile_resonance.poles.lacking import Directions
-from tactile_resonance.poles.model import RationalModel, Variable
+from tactile_resonance.poles.likelihood import Rules, Solution
+from tactile_resonance.poles.model import RationalModel
 from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.starts import (
     SEVERAL_MODES,
@@ -44,7 +41,7 @@ NORMAL_EQUATIONS_LIMIT = 1e5
 # Models of more poles than this go to the dense solver at once.
 LARGEST_BATCHED_ORDER = 6
 REBASE_ITERATIONS = 40
-ONLY_START = RULES._replace(iterations=0)
+ONLY_START = Rules(iterations=0)
 # Bases follow the denominator until it changes by less than this from one iteration to the next.
 REBASE_TOLERANCE = 1e-2
 
@@ -57,7 +54,7 @@ class LinesPlan(FitPlan):
 
     Attributes
     ----------
-    frequency_hz : (F,) float
+    lines_hz : (F,) float
     structure : ModelStructure
     band_hz : (low, high)
     start_size : (F,) float or None
@@ -66,7 +63,7 @@ class LinesPlan(FitPlan):
         In which the bases of A and of B are orthonormal there.
     """
 
-    frequency_hz: FloatArray
+    lines_hz: FloatArray
     structure: ModelStructure
     band_hz: tuple[float, float]
     start_size: FloatArray | None = None
@@ -83,41 +80,16 @@ class LinesPlan(FitPlan):
         """The plan of another structure."""
         return LinesPlan.on_lines(self.frequency_hz, structure, self.band_hz)
 
-    @cached_property
-    def variable(self) -> Variable:
-        """Of the polynomials."""
-        return Variable.for_lines(self.frequency_hz, self.structure)
-
-    @cached_property
-    def denominator_basis(self) -> PolynomialBasis:
-        """Orthonormal on the lines."""
-        return self._basis(self.structure.order, 0)
-
-    @cached_property
-    def numerator_basis(self) -> PolynomialBasis:
-        """Orthonormal on the lines."""
-        return self._basis(self.structure.numerator_order, 1)
-
-    def _basis(self, degree: int, which: int) -> PolynomialBasis:
-        x = self.variable.of_frequency(self.frequency_hz)
-        return PolynomialBasis.on_lines(x, degree, self.weights and self.weights[which])
+    @property
+    def frequency_hz(self) -> FloatArray:
+        """(F,) the lines."""
+        return self.lines_hz
 
     @cached_property
     def problem(self) -> Problem:
         """Driven bins without a transient."""
         none = np.empty((self.frequency_hz.size, 0), complex)
         return Problem(self.denominator_basis.values, self.numerator_basis.values, none)
-
-    @cached_property
-    def directions(self) -> Directions:
-        """What a richer model has in addition, on the lines."""
-        x = self.variable.of_frequency(self.frequency_hz)
-        return Directions.on_lines(self.frequency_hz, x, self.structure.numerator_order)
-
-    @property
-    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Bases of A and B on the lines; there is no C."""
-        return self.problem.denominator, self.problem.numerator, self.problem.transient
 
     @cached_property
     def delay_unit_s(self) -> float:
@@ -222,7 +194,7 @@ class LinesPlan(FitPlan):
         None where weights are not finite.
         """
         y, u = row.y[0, 0], row.u[0, 0]
-        weight = 1 / (np.broadcast_to(row.variance_y[0], y.shape) * size)
+        weight = 1 / (row.variance[0] * size)
         weight_y, weight_u = weight * np.abs(y) ** 2, weight * np.abs(u) ** 2
         mean_y, mean_u = weight_y.mean(), weight_u.mean()
         if not (np.isfinite([mean_y, mean_u]).all() and mean_y > 0 and mean_u > 0):
@@ -296,11 +268,8 @@ def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[Floa
     candidates = []
     for delay in step * np.arange(-2, 13):
         turned = row._replace(y=row.y * np.exp(1j * phase * delay))
-        theta = minimise(problem, turned, None, ONLY_START).theta[0, 0]
-        if not np.isfinite(theta).all():
-            continue
-        residual = Linearised.of(problem, turned, theta).residual
-        cost = float(np.sum(residual.real**2 + residual.imag**2))
-        candidates.append((cost, np.append(theta, delay)))
+        begun = minimise(problem, turned, None, ONLY_START)
+        if np.isfinite(begun.theta).all():
+            candidates.append((float(begun.cost[0]), np.append(begun.theta[0, 0], delay)))
     candidates.sort(key=lambda c: c[0])
     return [theta for _, theta in candidates[:3]] or [None]

@@ -106,19 +106,13 @@ class RationalModel:
         phase = 2 * np.pi * np.asarray(frequency_hz) * np.asarray(self.delay_s)[..., None]
         return b / a * np.exp(-1j * phase)
 
-    def residues(self, poles_rad_s: ComplexArray) -> ComplexArray:
-        """(..., k) residues of ``B / A`` at simple poles (..., k) [rad/s].
-
-        In the z-domain of the s-plane function with the same behaviour close to the pole.
-        """
-        return self.residues_and_sensitivity(poles_rad_s)[0]
-
     def residues_and_sensitivity(
         self, poles_rad_s: ComplexArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Residues (..., k) at simple poles (..., k), and the poles' derivatives (..., k, n).
+        """Residues (..., k) of ``B / A`` at simple poles (..., k) [rad/s], and derivatives (..., k, n).
 
-        The derivatives are those by the free coefficients of A.
+        In the z-domain residues are of the s-plane function with the same behaviour close to the pole. The
+        derivatives are those of the poles by the free coefficients of A.
         """
         x = self.variable.of_s(poles_rad_s)
         points = math.prod(x.shape[:-1])

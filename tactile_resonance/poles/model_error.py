@@ -59,18 +59,12 @@ def systematic_of(
         first, last = slice(0, half_of), slice(data.records - half_of, None)
         poles = [plan.compared(data.part(which), theta[:, which]) for which in (first, last)]
         moved = moved + difference_of_halves(*poles)
-    if plan.richer is not None and _fewest_lines(data) > plan.richer.structure.fewest_lines:
+    if plan.richer is not None and data.lines.min() > plan.richer.structure.fewest_lines:
         moved = moved + difference_of_models(poles_rad_s, *plan.richer.with_covariance(data))
     half_width = in_any_direction(np.abs(poles_rad_s.real), poles_rad_s)
     known = np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
     systematic[wrong] = np.where(known, moved, half_width)
     return systematic
-
-
-def _fewest_lines(data: BinData) -> int:
-    """Driven bins of a point that are not left out."""
-    used = np.isfinite(data.variance_y)
-    return int(np.broadcast_to(used, (len(used), data.driven)).sum(axis=-1).min())
 
 
 def model_error_factor(

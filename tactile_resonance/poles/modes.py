@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from math import comb
 
 import numpy as np
@@ -80,31 +79,18 @@ def two_roots(coefficients, h):
     return roots
 
 
-def propagated(
-    poles_rad_s: ComplexArray, sensitivity: ComplexArray, parameters: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Covariances (..., k, 2, 2) of (Re, Im) of poles (..., k), and of (f0_hz, damping_ratio).
+@entry
+def propagated(poles, sensitivity, parameters):
+    """Covariances (points, k, 2, 2) of (Re, Im) of poles (points, k), and of (f0_hz, damping_ratio).
 
     Parameters
     ----------
-    poles_rad_s : (..., k) complex
-    sensitivity : (..., k, p) complex
+    poles : (points, k) complex
+    sensitivity : (points, k, p) complex
         Derivatives of the poles by coefficients.
-    parameters : (..., n, n) float
+    parameters : (points, n, n) float
         Covariance of coefficients, of which the first p belong to the sensitivity.
     """
-    shape = poles_rad_s.shape
-    points = math.prod(shape[:-1])
-    of_poles, in_f0 = _propagated(
-        poles_rad_s.reshape(points, shape[-1]),
-        sensitivity.reshape(points, *sensitivity.shape[-2:]),
-        parameters.reshape(points, *parameters.shape[-2:]),
-    )
-    return of_poles.reshape(*shape, 2, 2), in_f0.reshape(*shape, 2, 2)
-
-
-@entry
-def _propagated(poles, sensitivity, parameters):
     points, count, p = sensitivity.shape
     of_poles, in_f0 = np.empty((points, count, 2, 2)), np.empty((points, count, 2, 2))
     for point in range(points):
@@ -134,7 +120,6 @@ def _propagated(poles, sensitivity, parameters):
     return of_poles, in_f0
 
 
-
 def pole_quantities(
     model: RationalModel, band_hz: tuple[float, float], parameters: FloatArray
 ) -> tuple[dict[str, npt.NDArray], ComplexArray]:
@@ -143,15 +128,15 @@ def pole_quantities(
     Parameters
     ----------
     model : RationalModel
-        Leading axes (...).
+        Of points.
     band_hz : (low, high)
-    parameters : (..., n, n) float
+    parameters : (points, n, n) float
         Covariance of the free coefficients, those of the denominator first.
 
     Returns
     -------
     dict
-    sensitivity : (..., k, n) complex
+    sensitivity : (points, k, n) complex
         Derivatives of the poles by the coefficients of the denominator.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

@@ -21,6 +21,7 @@ from scipy.ndimage import median_filter
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.tones import ROUNDING, Tone, level_around
 
@@ -66,8 +67,8 @@ def falls_without_each(
     shared = shared * scale[:, None]  # (M, K, n)
     own = of_c * scale[:, None]
     records, bins, n = shared.shape
-    of_own = np.linalg.qr(_real_rows(own))[0]  # (2 K, c)
-    rest = _real_rows(shared)  # (M, 2 K, n)
+    of_own = np.linalg.qr(real_rows(own).reshape(2 * bins, own.shape[-1]))[0]  # (2 K, c)
+    rest = real_rows(shared).reshape(records, 2 * bins, n)
     for _ in range(2):  # twice is enough: the second pass removes what rounding left
         rest = rest - of_own @ (of_own.T @ rest)
     of_shared = np.linalg.qr(rest.reshape(-1, n))[0].reshape(rest.shape)
@@ -80,13 +81,6 @@ def falls_without_each(
     falls = (r * re**2 - 2 * b * re * im + p * im**2) / (p * r - b**2)
     least = (p + r) / 2 - np.hypot((p - r) / 2, b)  # eigenvalue
     return np.asarray(np.where(least > 1 - CERTAIN_LEVERAGE, falls, 0.0))
-
-
-def _real_rows(values: ComplexArray) -> FloatArray:
-    """(..., 2 K, n) real and imaginary parts of values (..., K, n), one after the other."""
-    parts = np.stack([values.real, values.imag], axis=-2)
-    *shape, bins, n = values.shape
-    return parts.reshape(*shape, 2 * bins, n)
 
 
 def chances_of(

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import RULES, Solution, minimise
+from tactile_resonance.poles.fit import minimise
+from tactile_resonance.poles.lacking import Directions
+from tactile_resonance.poles.likelihood import Rules, Solution
 from tactile_resonance.poles.model import RationalModel, Variable
 from tactile_resonance.poles.modes import (
     beside_others,
@@ -28,11 +30,9 @@ from tactile_resonance.poles.tables import Problem
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from tactile_resonance.poles.lacking import Directions
-
 # Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
 # in particular.
-COMPARISON = RULES._replace(iterations=8)
+COMPARISON = Rules(iterations=8)
 
 
 class FitPlan(ABC):
@@ -42,40 +42,57 @@ class FitPlan(ABC):
     ----------
     structure : ModelStructure
     band_hz : (low, high)
+    weights : pair of float arrays, or None
+        In which the bases of A, on all bins, and of B, on the driven ones, are orthonormal.
     """
 
     structure: ModelStructure
     band_hz: tuple[float, float]
+    weights: tuple[FloatArray, FloatArray] | None = None
 
     @property
     @abstractmethod
+    def frequency_hz(self) -> FloatArray:
+        """(K,) of all bins, or lines."""
+
+    @property
+    def excited_at(self) -> IntArray | slice:
+        """Places of the driven bins that are used among all."""
+        return slice(None)
+
+    @cached_property
     def variable(self) -> Variable:
         """Of the polynomials."""
+        return Variable.for_lines(self.frequency_hz, self.structure)
 
-    @property
-    @abstractmethod
+    @cached_property
+    def x(self) -> ComplexArray:
+        """(K,) the variable on all bins."""
+        return self.variable.of_frequency(self.frequency_hz)
+
+    @cached_property
     def denominator_basis(self) -> PolynomialBasis:
         """Of A."""
+        return PolynomialBasis.on_lines(self.x, self.structure.order, self.weights and self.weights[0])
 
-    @property
-    @abstractmethod
+    @cached_property
     def numerator_basis(self) -> PolynomialBasis:
         """Of B."""
+        x, degree = self.x[self.excited_at], self.structure.numerator_order
+        return PolynomialBasis.on_lines(x, degree, self.weights and self.weights[1])
 
     @property
     @abstractmethod
     def problem(self) -> Problem:
         """What the fit is made of."""
 
-    @property
-    @abstractmethod
+    @cached_property
     def directions(self) -> Directions:
         """What a richer model has in addition, on the driven bins."""
-
-    @property
-    @abstractmethod
-    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Bases of A, B and C on the driven bins."""
+        driven = self.excited_at
+        return Directions.on_lines(
+            self.frequency_hz[driven], self.x[driven], self.structure.numerator_order
+        )
 
     @abstractmethod
     def with_structure(self, structure: ModelStructure) -> Self | None:
@@ -100,15 +117,8 @@ class FitPlan(ABC):
 
     def model_of(self, theta: FloatArray) -> RationalModel:
         """The model of coefficients (batch, n)."""
-        a, b, _ = self.problem.sizes
-        return RationalModel(
-            denominator=np.concatenate([theta[:, :a], np.ones((theta.shape[0], 1))], axis=1),
-            numerator=theta[:, a : a + b],
-            transient=theta[:, a + b :],
-            variable=self.variable,
-            denominator_basis=self.denominator_basis,
-            numerator_basis=self.numerator_basis,
-        )
+        coefficients, bases = self.problem.split(theta), (self.denominator_basis, self.numerator_basis)
+        return RationalModel(*coefficients, self.variable, *bases)
 
     def poles_in_band(self, theta: FloatArray) -> ComplexArray:
         """(batch, places) poles [rad/s] of coefficients (batch, n)."""

@@ -91,7 +91,9 @@ class Spread:
         covariance = 0.5 * inverse @ inner.reshape(-1, n, n) @ inverse.swapaxes(-1, -2)
         step = step.reshape(batch, records, a + b)
         covariance = covariance.reshape(batch, records, a, a)
-        turn = _turn(plan, theta[:, 0])  # (batch, places, 2, a)
+        poles = plan.poles_in_band(theta[:, 0])
+        _, sensitivity = plan.model_of(theta[:, 0]).residues_and_sensitivity(poles)  # (batch, places, a)
+        turn = natural_frequency_and_damping_jacobian(poles) @ real_rows(sensitivity)
         departure = np.einsum("bpia,bma->bmpi", turn, step[..., :a])
         expected = np.einsum("bpia,bmac,bpic->bmpi", turn, covariance, turn)
         return cls(step.mean(axis=1), departure, expected, 2 * dof, turn)
@@ -199,10 +201,3 @@ class Spread:
             here = (away > limit) & (away > size) & (others.weight == 0)
             odd[here], size[here] = m, away[here]
         return odd, size
-
-
-def _turn(plan: JointPlan, theta: FloatArray) -> FloatArray:
-    """(batch, places, 2, a) derivative of (f0_hz, damping_ratio) by the denominator's coefficients."""
-    poles = plan.poles_in_band(theta)
-    _, sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)  # (batch, places, a)
-    return np.asarray(natural_frequency_and_damping_jacobian(poles) @ real_rows(sensitivity))

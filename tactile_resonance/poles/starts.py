@@ -27,11 +27,12 @@ from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     DenseSolution,
     Linearised,
-    Solution,
     least_squares,
     minimise,
+    real_solution,
 )
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
+from tactile_resonance.poles.likelihood import Solution
 from tactile_resonance.poles.modes import fall_of_noise
 from tactile_resonance.poles.plan import FitPlan
 
@@ -90,7 +91,7 @@ def _split_starts(
     model = plan.model_of(theta[:, 0])
     start = np.full(theta.shape, np.nan)
     poles_of_all = model.poles_rad_s()  # (points, a)
-    heights = np.abs(model.residues(poles_of_all)) / np.abs(poles_of_all.real)
+    heights = np.abs(model.residues_and_sensitivity(poles_of_all)[0]) / np.abs(poles_of_all.real)
     for k, of_point in enumerate(poles_of_all):
         above, height = (values[of_point.imag > 0] for values in (of_point, heights[k]))
         if above.size < 2 or not np.isfinite(height).all():
@@ -117,27 +118,17 @@ def _coefficients(plan: FitPlan, data: BinData, poles: ComplexArray) -> FloatArr
     logarithm = np.sum(np.log(x[:, None] - roots), axis=-1)  # many factors over decades overflow
     phase = np.exp(1j * logarithm.imag)  # A / |A|
     weighted = basis * np.exp(np.mean(logarithm.real) - logarithm.real)[:, None]
-    denominator = _real_solution(weighted, phase)
+    denominator = real_solution(weighted, phase)
     theta = np.zeros(a + b + data.records * own)
     theta[:a] = denominator[:-1] / denominator[-1]
     linear = Linearised.of(plan.problem, data, theta)
     used = np.isfinite(linear.variance)
     weight = np.tile(1 / np.sqrt(linear.variance[used]), data.records)
-    theta[a:] = _real_solution(
+    theta[a:] = real_solution(
         linear.slope[:, used, a:].reshape(weight.size, -1) * weight[:, None],
         linear.error[:, used].ravel() * weight,
     )
     return theta
-
-
-def _real_solution(matrix: ComplexArray, right: ComplexArray) -> FloatArray:
-    """Real least squares solution of complex equations, whatever the scales of its unknowns."""
-    rows = np.concatenate([matrix.real, matrix.imag])
-    scale = np.linalg.norm(rows, axis=0)
-    right = np.concatenate([right.real, right.imag])
-    if not (np.isfinite(rows).all() and np.isfinite(right).all() and (scale > 0).all()):
-        return np.full(scale.size, np.nan)
-    return np.linalg.lstsq(rows / scale, right, rcond=None)[0] / scale
 
 
 @np.errstate(all="ignore")
@@ -206,7 +197,7 @@ def dispensable(plan: LinesPlan, row: BinData, theta: FloatArray, cost: float) -
     above = poles[poles.imag > 0]
     if less is None:
         return np.empty(0, complex)
-    lines = int(np.isfinite(_variance(plan, row)).sum())
+    lines = int(row.lines[0])
     limit = fall_of_noise(lines) * cost / (lines - theta.size / 2)
     out = []
     for k, pole in enumerate(above):
@@ -232,8 +223,7 @@ def _minimum_from(
     plan: LinesPlan, row: BinData, poles: ComplexArray
 ) -> tuple[LinesPlan, DenseSolution] | None:
     """Fit that begins with these poles, of a plan with bases that suit them; None where there is none."""
-    x = plan.variable.of_frequency(plan.frequency_hz)
-    logarithm = 2 * np.sum(np.log(np.abs(x[:, None] - plan.variable.of_s(poles))), axis=-1)
+    logarithm = 2 * np.sum(np.log(np.abs(plan.x[:, None] - plan.variable.of_s(poles))), axis=-1)
     there = plan.of_size(row, np.exp(logarithm - logarithm.mean()))
     start = None if there is None else _coefficients(there, row, poles)
     if there is None or start is None or not np.isfinite(start).all():
@@ -262,7 +252,7 @@ def _most_lacking(
     plan: LinesPlan, row: BinData, solution: DenseSolution, tried: ComplexArray
 ) -> tuple[complex, float]:
     """The mode that is missed most, and the logarithm of how likely noise alone misses it; see `lacking`."""
-    variance = _variance(plan, row)
+    variance = row.variance[0]
     used = np.isfinite(variance)
     jacobian = solution.jacobian[0][used].reshape(-1, solution.theta.size)
     basis = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0]
@@ -309,21 +299,16 @@ def _falls(
     return np.where(determinant > LEAST_LEFT * whole, fall, 0.0)
 
 
-def _variance(plan: LinesPlan, row: BinData) -> FloatArray:
-    """(F,) of Y."""
-    return np.broadcast_to(row.variance_y[0], plan.frequency_hz.shape)
-
-
 def _linear_cost(plan: LinesPlan, row: BinData, poles: ComplexArray) -> float:
     """Cost with given poles and the residues that fit best, of a variance that does not depend on them."""
     roots = plan.variable.of_s(poles)
-    x = plan.variable.of_frequency(plan.frequency_hz)[:, None]
+    x = plan.x[:, None]
     above, real = roots[roots.imag > 0], roots[roots.imag == 0]
     first, second, single = 1 / (x - above), 1 / (x - above.conj()), 1 / (x - real)
     terms = plan.structure.numerator_order - plan.structure.order
-    rest = PolynomialBasis.on_lines(x[:, 0], max(terms, 0)).values if terms >= 0 else np.empty((x.size, 0))
+    rest = PolynomialBasis.on_lines(plan.x, max(terms, 0)).values if terms >= 0 else np.empty((x.size, 0))
     columns = np.concatenate([first + second, 1j * (first - second), single, rest], axis=1)
-    variance = _variance(plan, row)
+    variance = row.variance[0]
     used = np.isfinite(variance)
     weight = 1 / np.sqrt(variance[used])
     columns = columns[used] * (weight * row.u[0, 0][used])[:, None]

@@ -14,6 +14,7 @@ from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.compiled import compiled
 from tactile_resonance.poles.likelihood import (
     BLOCK,
+    CACHE_LINE,
     ROW_A,
     ROW_AA,
     ROW_AB,
@@ -27,8 +28,6 @@ from tactile_resonance.poles.likelihood import (
     ROW_OF_B,
     ROW_OF_C,
 )
-
-CACHE_LINE = 64  # bytes
 
 # Weight of the products of two kinds of coefficients, of C, A and B in this order.
 WEIGHTS = {
@@ -172,20 +171,6 @@ class Tables(NamedTuple):
     c: int
     from_driven: bool
 
-    @classmethod
-    def of(
-        cls, denominator: ComplexArray, numerator: ComplexArray, transient: ComplexArray
-    ) -> Tables:
-        """Of bases (K, a + 1), (K_driven, b) and (K, c) with the undriven bins first."""
-        first = denominator.shape[0] - numerator.shape[0]
-        a, b, c = denominator.shape[1] - 1, numerator.shape[1], transient.shape[1]
-        n = a + b + c
-        undriven, driven = (
-            Part.of(denominator[here, a], [transient[here], denominator[here, :a], *more], n)
-            for here, more in ((slice(0, first), ()), (slice(first, None), (numerator,)))
-        )
-        return cls(undriven, driven, a, b, c, bool(first > 0 and numerator.shape[0] >= n))
-
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -219,7 +204,22 @@ class Problem:
     def tables(self) -> Tables:
         """For `likelihood`."""
         compiled()  # here and not in the first fit, whose time may matter
-        return Tables.of(self.denominator, self.numerator, self.transient)
+        first, (a, b, c) = self.undriven, self.sizes
+        n = a + b + c
+        undriven, driven = (
+            Part.of(of_a[:, a], [of_c, of_a[:, :a], *of_b], n)
+            for of_a, of_c, *of_b in (
+                (self.denominator[:first], self.transient[:first]),
+                (self.denominator[first:], self.transient[first:], self.numerator),
+            )
+        )
+        return Tables(undriven, driven, a, b, c, first > 0 and self.numerator.shape[0] >= n)
+
+    @property
+    def driven_bases(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Of A, B and C on the driven bins."""
+        driven = slice(self.undriven, None)
+        return self.denominator[driven], self.numerator, self.transient[driven]
 
     def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients of A (with its last), B and C, each (..., terms), of theta (..., n)."""

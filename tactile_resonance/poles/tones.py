@@ -216,7 +216,7 @@ def _taken_too(
     for _ in range(MOST_RETURNS):
         here = fitted.plan
         rest = fitted.u if channel == "actuator" else fitted.errors()
-        unknown = here.bins[here.driven] if channel == "actuator" else here.excited_bins
+        unknown = here.bins[here.driven] if channel == "actuator" else here.bins[here.excited_at]
         at, phasor = _tone_near(here, rest + tone.leak(here), k, unknown)
         near = here.bins[np.abs(here.bins - at) <= NEAR_BINS]
         moved = abs(at - tone.at)

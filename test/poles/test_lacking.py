@@ -126,7 +126,7 @@ def test_a_complete_model_lacks_nothing(cell, structure):
         y[:, None],
         u[:, None],
         plan.order,
-        plan.other_bins.size,
+        plan.others_at.size,
         rest=variance_y,
         variance_y=variance_y,
         variance_u=variance_u,
@@ -138,7 +138,7 @@ def test_a_complete_model_lacks_nothing(cell, structure):
 def test_a_complete_model_of_several_realisations_lacks_nothing(records, periods):
     """Their transients take up a little of every direction, which the tests allow for."""
     plan, u, y = realisations(2000, records, periods, 20.0)
-    assert_nothing_lacks(plan, BinData.of(y, u, plan.order, plan.other_bins.size))
+    assert_nothing_lacks(plan, BinData.of(y, u, plan.order, plan.others_at.size))
 
 
 def test_a_complete_model_of_an_frf_lacks_nothing():
@@ -173,7 +173,7 @@ def realisations(runs, records, periods, snr_db, beside=()):
     """Plan and bins u, y (runs, M, K) of a mode at 250 Hz and others, from any initial state."""
     kind = JointPlan if records == 1 else PoleEstimator
     plan = kind(5e3, 2000, periods, np.arange(4, 401), (200.0, 300.0), transient_terms=8)
-    hz, rng = plan.frequency_hz(plan.bins), np.random.default_rng(11)
+    hz, rng = plan.frequency_hz, np.random.default_rng(11)
     u = np.zeros((runs, records, hz.size), complex)
     phase = 2 * np.pi * rng.random((runs, records, plan.excited_at.size))
     u[..., plan.excited_at] = np.exp(1j * phase)
@@ -195,7 +195,7 @@ def test_doubt_is_what_a_fit_with_two_terms_more_differs_by(records, periods):
     runs = 40
     plan, u, y = realisations(runs, records, periods, 60.0, BESIDE)
     richer = replace(plan, structure=ModelStructure.with_residual(2, 8))
-    data = BinData.of(y, u, plan.order, plan.other_bins.size)
+    data = BinData.of(y, u, plan.order, plan.others_at.size)
     fit, more = minimise(plan.problem, data), minimise(richer.problem, data)
     lack = Lack.of(plan, data, fit, np.ones(runs, bool))
     rows = np.flatnonzero(lack.chi_square > 12)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cost against its formula, the fit against full precision, points against the same in a batch."""
 
-import dataclasses
 
 import numpy as np
 import pytest
@@ -10,9 +9,9 @@ from scipy import stats
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
 from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import RULES, Linearised, least_squares, minimise, refit_failed
+from tactile_resonance.poles.fit import Linearised, least_squares, minimise, refit_failed
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.likelihood import invert, moments
+from tactile_resonance.poles.likelihood import Rules, invert, moments
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem
@@ -61,7 +60,7 @@ def problem_and_data(points, records, errors_in_variables, transient, driven=15)
 
 
 def start_values(problem, data):
-    return minimise(problem, data, None, RULES._replace(iterations=0)).theta
+    return minimise(problem, data, None, Rules(iterations=0)).theta
 
 
 def flat_theta(problem, theta):
@@ -147,10 +146,10 @@ def test_points_that_steps_lost_are_found_at_full_precision(records):
     """Searches ended at once, all or some of a batch: what comes back is what they would have found."""
     problem, data = problem_and_data(5, records, False, True)
     found = minimise(problem, data)
-    lost = minimise(problem, data, None, RULES._replace(iterations=0))
+    lost = minimise(problem, data, None, Rules(iterations=0))
     assert found.converged.all()
     assert not lost.converged.any()
-    some = dataclasses.replace(found, converged=np.arange(5) != 2, theta=found.theta.copy())
+    some = found._replace(converged=np.arange(5) != 2, theta=found.theta.copy())
     some.theta[2] = lost.theta[2]
     refit_failed(problem, lost, data)
     assert_same(lost, found)
@@ -265,7 +264,7 @@ def test_every_length_of_numerators(terms, numerator_order):
     u, y = points_of(plant)
     one = np.full((POINTS, 1), plant.noise[0])
     data = BinData.of(
-        y[:, None], u[:, None], plan.order, plan.other_bins.size, rest=one, variance_y=one
+        y[:, None], u[:, None], plan.order, plan.others_at.size, rest=one, variance_y=one
     )
     found = minimise(plan.problem, data)
     refit_failed(plan.problem, found, data)
@@ -282,7 +281,7 @@ def test_odd_points_leave_the_others_of_a_batch_alone():
     clean = plan.from_bins(u, y)
     rng = np.random.default_rng(5)
     noise = rng.standard_normal((POINTS, 2 * y.shape[1])).view(complex) * np.sqrt(plant.noise[0])
-    others = np.isin(plan.bins, plan.other_bins)
+    others = np.isin(plan.bins, plan.bins[plan.others_at])
     y[1, 100] += 300 * noise[1, 100]  # a wild bin
     u[2, 7] = np.nan
     y[3] += noise[3] * np.linspace(0, 5, y.shape[1])  # sloped noise

@@ -51,7 +51,7 @@ def test_derivatives_equal_differences(model):
             return values[np.argmin(np.abs(values - target))]
 
         new = [nearest(m.poles_rad_s(), pole[0]) for m in moved]
-        residues = [m.residues(np.array([p]))[0] for m, p in zip(moved, new, strict=True)]
+        residues = [m.residues_and_sensitivity(np.array([p]))[0][0] for m, p in zip(moved, new, strict=True)]
         slope = (residues[0] - residues[1]) / (2 * step)
         assert residue_by[0, k] == pytest.approx(slope, rel=1e-4, abs=1e-4 * abs(residue_by).max())
         if k < n:
