@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands
@@ -26,7 +27,7 @@ from tactile_resonance.scan.progress import Controls
 from tactile_resonance.scan.run_content import RunContent, read_run
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
-from tactile_resonance.scan.scene import Hold, Output, ScanScene, read_scan_scene
+from tactile_resonance.scan.scene import Output, ScanScene, read_scan_scene
 from tactile_resonance.scan.surface import Plane
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over
@@ -89,7 +90,7 @@ class VirtualHands:
         """Nobody keeps anything from its work."""
         return False
 
-    def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
+    def touch(self, point: ScanPoint, force_n: float, hold: HoldMode, check: Check) -> None:
         """Travel there and press: time goes on, and the force is off by its error."""
         check()
         there = np.array(point.position_m)

@@ -17,6 +17,7 @@ from rclpy.serialization import serialize_message
 
 from tactile_resonance import msg
 from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes.goals import POLL_S, Poll, answer_of
@@ -45,7 +46,6 @@ from tactile_resonance.scan.hands import (
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_directory import PointRecording
-from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.surface import Plane
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
 from tactile_resonance.scan.tissue_tests import TOPIC, TYPE, ProtocolRequest
@@ -150,7 +150,7 @@ class NodeHands:
         """Whether somebody has stopped the tip, or deactivated what is missing, as a supervisor does."""
         return self._is_stopped() or self._nodes.held()
 
-    def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
+    def touch(self, point: ScanPoint, force_n: float, hold: HoldMode, check: Check) -> None:
         """Bring the tip there and press until the force is held."""
         pose = self._pose_of(point)
         if self._tip is None:

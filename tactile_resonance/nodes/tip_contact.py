@@ -13,9 +13,11 @@ from std_srvs.srv import SetBool, Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
+from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll, answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.messages import HOLDS
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.stop_input import STOP
@@ -32,7 +34,6 @@ from tactile_resonance.scan.hands import (
     SurfaceMissing,
 )
 from tactile_resonance.scan.point_outcome import StateTimes
-from tactile_resonance.scan.scene import Hold
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
 
 STATE_TOPIC = "contact_state"
@@ -113,7 +114,7 @@ class TipContact:
         self,
         pose: PoseStamped,
         force_n: float,
-        hold: Hold,
+        hold: HoldMode,
         check: Check,
         poll: Poll,
         standoff_m: float = math.inf,
@@ -122,7 +123,7 @@ class TipContact:
         goal = MakeContact.Goal(pose=pose, force_n=force_n)
         self._low = math.isfinite(standoff_m)
         goal.standoff_m = standoff_m if self._low else 0.0
-        goal.hold = goal.HOLD_FORCE if hold is Hold.FORCE else goal.HOLD_INDENTATION
+        goal.hold = HOLDS[hold]
         result, poll = self._make(goal, check, poll), self._going(poll)
         while (state := self._state).state != state.STATE_HOLD:
             poll()

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:  # nodes that take goals need what may go wrong, and load nothing of scenes and runs for it
+    from tactile_resonance.contact.law import HoldMode
     from tactile_resonance.contact.samples import Pose
     from tactile_resonance.frf.result import BandDistortion
     from tactile_resonance.poles.result import Poles
@@ -18,7 +19,6 @@ if TYPE_CHECKING:  # nodes that take goals need what may go wrong, and load noth
     from tactile_resonance.scan.measurement import MeasurementDesign
     from tactile_resonance.scan.points import ScanPoint
     from tactile_resonance.scan.run_directory import PointRecording
-    from tactile_resonance.scan.scene import Hold
     from tactile_resonance.scan.tissue_tests import ProtocolRequest
 
 ATTEMPTS = 6  # at what is disturbed: a point, a reference, a touch
@@ -170,7 +170,7 @@ class Hands(Protocol):
         """Whether somebody keeps what is missing from its work, and will let it go on."""
         ...
 
-    def touch(self, point: ScanPoint, force_n: float, hold: Hold, check: Check) -> None:
+    def touch(self, point: ScanPoint, force_n: float, hold: HoldMode, check: Check) -> None:
         """Bring the tip there and press until the force is held."""
         ...
 

@@ -27,10 +27,10 @@ import numpy.typing as npt
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.poles.basis import default_transient_terms
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
+from tactile_resonance.tones import MAINS_HZ
 
 FREE_LINES = 12
 """Excited lines of a band beyond those that its coefficients take up: the level of the noise is from them."""
-MAINS_HZ = (50.0, 60.0)
 LEAST_DISTANCE = 0.15
 """Of a harmonic of the mains from an excited line, in spacings of the lines."""
 LONGER = 1.15

@@ -16,6 +16,7 @@ from typing import Annotated, Any, cast
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.fields import (
     build,
     check_above_zero,
@@ -48,13 +49,6 @@ AUTO = "auto"
 
 MOST_FORCE_N = 1.0
 """A hundred times the preload of the method: beyond it a figure is a slip of the unit."""
-
-
-class Hold(str, Enum):
-    """What contact control keeps while it is measured."""
-
-    FORCE = "force"
-    INDENTATION = "indentation"
 
 
 class Output(str, Enum):
@@ -223,7 +217,7 @@ class ScanScene:
         Frame of positions and surface.
     force_n : float
         Contact force [N].
-    hold : Hold
+    hold : HoldMode
     sensor : SensorUse
     surface : Surface or TouchRequest
     positions_m : (n, 3) float
@@ -259,7 +253,7 @@ class ScanScene:
     force_n: float
     positions_m: FloatArray
     frame_id: str = "table"
-    hold: Hold = Hold.FORCE
+    hold: HoldMode = HoldMode.FORCE
     sensor: SensorUse = field(default_factory=SensorUse)
     surface: Surface | TouchRequest = field(default_factory=Plane)
     outputs: tuple[Output, ...] = (Output.POLES, Output.MAP)

@@ -16,6 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.nodes import scan_hands
 from tactile_resonance.nodes.contact_node import ContactNode
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
@@ -32,7 +33,7 @@ from tactile_resonance.scan.clearance import Standoffs
 from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceEarly
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.scene import Hold, ScanScene
+from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.surface import Plane
 from test.spinning import spin_until
 
@@ -73,7 +74,7 @@ def alone():
 def test_a_bench_discovered_after_the_scan_began_takes_up_the_first_place(alone):
     hands = alone.start(Scanning).hands
     point = ScanPoint(0, PLACE_M, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))
-    touch = threading.Thread(target=hands.touch, args=(point, 0.01, Hold.FORCE, lambda: None))
+    touch = threading.Thread(target=hands.touch, args=(point, 0.01, HoldMode.FORCE, lambda: None))
     with hands.listening():
         touch.start()
         assert not spin_until(alone.executor, lambda: not touch.is_alive(), 0.5)
@@ -148,7 +149,7 @@ def test_points_beside_each_other_are_begun_low_until_the_surface_is_met_too_ear
 
         def touch(x_m):
             point = ScanPoint(0, (x_m, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))
-            hands.touch(point, 0.01, Hold.FORCE, lambda: None)
+            hands.touch(point, 0.01, HoldMode.FORCE, lambda: None)
             hands.retract()
 
         for x_m in (0.0, 5e-3, 10e-3):

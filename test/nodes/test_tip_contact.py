@@ -11,12 +11,12 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
+from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact
 from tactile_resonance.scan.hands import PointDisturbed, ScanEnded
 from tactile_resonance.scan.point_outcome import StateTimes
-from tactile_resonance.scan.scene import Hold
 
 NOT_OF_THE_POINT = (
     "force_stale",
@@ -57,7 +57,7 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
         return SimpleNamespace(contact_s=0.3)
 
     monkeypatch.setattr(tip, "_make", make)
-    tip.hold(PoseStamped(), 0.01, Hold.FORCE, lambda: None, lambda: None)
+    tip.hold(PoseStamped(), 0.01, HoldMode.FORCE, lambda: None, lambda: None)
     assert tip.touched_ns == 4_700_000_000
     assert tip.spent_s["press_s"] == pytest.approx(0.1)
     assert tip.spent_s["hold_s"] == pytest.approx(0.08)

@@ -6,9 +6,10 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.scan.decision import Precise, Separate
 from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.scene import Hold, OnFailure, Output, read_scan_scene
+from tactile_resonance.scan.scene import OnFailure, Output, read_scan_scene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
@@ -91,7 +92,7 @@ def test_classes_of_the_inclusion_are_the_benchs_own():
 
 def test_defaults_and_choices(tmp_path):
     scene = read(tmp_path)
-    assert (scene.hold, scene.on_failure) == (Hold.FORCE, OnFailure.CONTINUE)
+    assert (scene.hold, scene.on_failure) == (HoldMode.FORCE, OnFailure.CONTINUE)
     assert scene.outputs == (Output.POLES, Output.MAP)
     assert scene.precision is None
     assert scene.frame_id == "table"
@@ -104,7 +105,7 @@ def test_defaults_and_choices(tmp_path):
         blocks={"least": 2},
         tissue_classes=CLASSES,
     )
-    assert (scene.hold, scene.on_failure) == (Hold.INDENTATION, OnFailure.STOP)
+    assert (scene.hold, scene.on_failure) == (HoldMode.INDENTATION, OnFailure.STOP)
     assert scene.outputs == (Output.POLES, Output.DISTORTION)
     assert scene.precision == Precise(f0_std_hz=0.02)
     assert (scene.blocks.least, scene.blocks.most) == (2, 8)
