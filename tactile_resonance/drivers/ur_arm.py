@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import threading
 import time
@@ -218,7 +219,8 @@ class UrArm:
         while (newest := states.newest) is not None:
             if round(newest.robot_time_s * 1e9) >= robot_ns:
                 return
-            select.select([states.stream], [], [], 0.1)
+            with contextlib.suppress(ValueError):  # closed meanwhile, which the next look finds
+                select.select([states.stream], [], [], 0.1)
             self.receive(now_known=True)
 
     def date_anew(self) -> None:

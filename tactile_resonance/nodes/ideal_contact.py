@@ -114,7 +114,6 @@ class IdealContact:
             missing = not_reached(Cause.SURFACE_MISSING, "nothing to touch there")
             return self._say(State.IDLE, missing)
         now_ns = self._tip.now_ns()
-        request.pose.header.stamp = time_message(now_ns)
         self._tip.place(Stay(now_ns, request.force_n, request.pose))
         took_s, (depth_m, surface_m) = (now_ns - began_ns) * 1e-9, found
         reached = ContactResult(
@@ -190,6 +189,5 @@ class IdealContact:
             state.force_n, state.depth_m = stay.force_n, result.depth_m
         self._states.publish(state)
         if stay.pose.header.frame_id:
-            stay.pose.header.stamp = now
-            self._poses.publish(stay.pose)
+            self._poses.publish(stay.pose_at(now_ns))
         self._wrenches.publish(pressing(stay.force_n, now, frame_id))

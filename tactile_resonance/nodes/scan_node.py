@@ -172,7 +172,7 @@ class OneGoal:
                 goal.abort()
                 return busy
             self.handle, self.controls = goal, Controls()
-            if goal.is_cancel_requested:  # before there were controls
+            if goal.is_cancel_requested or not self._node.active:  # before there were controls
                 self.cancel()
             try:
                 with self._around():

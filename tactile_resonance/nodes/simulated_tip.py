@@ -20,7 +20,12 @@ from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.vectors import Vector, vector
 from tactile_resonance.nodes.bench_player import PlantChild
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.messages import poles_to_message, pose_to_message, write_force_over
+from tactile_resonance.nodes.messages import (
+    poles_to_message,
+    pose_to_message,
+    time_message,
+    write_force_over,
+)
 from tactile_resonance.nodes.parameters import pose_of, values
 from tactile_resonance.nodes.running import PLACES, STREAM, TRUTHS
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -61,6 +66,12 @@ class Stay:
     force_n: float
     pose: PoseStamped
 
+    def pose_at(self, time_ns: int) -> PoseStamped:
+        """The pose, stamped with a ROS time [ns]."""
+        stamped = PoseStamped(pose=self.pose.pose)
+        stamped.header.frame_id, stamped.header.stamp = self.pose.header.frame_id, time_message(time_ns)
+        return stamped
+
 
 class Stays:
     """Where the tip was and how hard it pressed, and what follows for an interval."""
@@ -88,7 +99,7 @@ class Stays:
             span_ns = max(0, until_ns - max(start_ns, stay.since_ns))
             if span_ns:
                 spans.append((span_ns, stay.force_n))
-                response.tip_pose = stay.pose
+                response.tip_pose = stay.pose_at((start_ns + end_ns) // 2)
             until_ns = min(until_ns, stay.since_ns)
         seen_ns = sum(span_ns for span_ns, _ in spans)
         response.coverage = seen_ns / (end_ns - start_ns)
