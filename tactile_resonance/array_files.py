@@ -87,7 +87,9 @@ def read_arrays(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]
 def _read_npz(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
     try:
         with zipfile.ZipFile(path) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            # of two of one name that with the suffix counts, as numpy has it
+            infos = sorted(archive.infolist(), key=lambda info: info.filename.endswith(".npy"))
+            members = {info.filename.removesuffix(".npy"): info for info in infos}
             held = {name: info for name, info in members.items() if name in wanted}
             most = max((info.file_size for info in held.values()), default=0)
             if most > MOST_BYTES:

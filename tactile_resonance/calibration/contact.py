@@ -205,10 +205,10 @@ class Moduli:
     Attributes
     ----------
     storage_pa, storage_std_pa, loss_pa, loss_std_pa : float
-        Of the modulus at the mode, radiation taken off; NaN where there is no radius, or one above the ball's.
+        Of the modulus at the mode, radiation taken off.
     contact_radius_m : float
     radius_ratio : float
-        Over the ball's.
+        Over the ball's. All six are NaN where there is no radius, or one above the ball's.
     status : ContactStatus
         OK, BEYOND_HERTZ where the radius is too large for Hertz's law, NO_FORCE where there is no radius.
     message : str

@@ -11,9 +11,12 @@ from __future__ import annotations
 
 import math
 import threading
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
+from operator import itemgetter
 
 import numpy as np
 
@@ -161,8 +164,8 @@ class ForceRecord:
             now_ns, zero_std_n = self._now_ns, self._zero_std_n
             full = len(self._forces) == self._forces.maxlen
             oldest_ns = self._forces[0][0] if full else -math.inf
-            times, rows = _around(self._forces, t0_ns, t1_ns, 1)
-            pose_times, poses = _around(self._poses, t0_ns, t1_ns, 6)
+            heard, placed = (_cut(rows, t0_ns, t1_ns) for rows in (self._forces, self._poses))
+        (times, rows), (pose_times, poses) = _columns(heard, 1), _columns(placed, 6)
         spans = _Spans(times, rows, t0_ns, t1_ns, self._force_gap_ns)
         places = _Spans(pose_times, poses[:, :3], t0_ns, t1_ns, POSE_GAP_NS)
         position_m = rotation_rad = (math.nan, math.nan, math.nan)
@@ -256,17 +259,13 @@ class _Spans:
         return float(means.std(ddof=1) / math.sqrt(BATCHES))
 
 
-def _around(
-    rows: deque[tuple[float, ...]], t0_ns: int, t1_ns: int, width: int
-) -> tuple[IntArray, FloatArray]:
-    """Times (n,) and values (n, width) of an interval, and one row more on either side."""
-    kept: list[tuple[float, ...]] = []
-    for row in reversed(rows):  # what is asked for has just been
-        if row[0] >= t1_ns:
-            kept.clear()
-        kept.append(row)
-        if row[0] <= t0_ns:
-            break
-    kept.reverse()
-    values = np.array([row[1:] for row in kept], float).reshape(len(kept), width)
-    return np.array([row[0] for row in kept], np.int64), values
+def _cut(rows: deque[tuple[float, ...]], t0_ns: int, t1_ns: int) -> list[tuple[float, ...]]:
+    """Rows of an interval, and one more on either side; quick, for the control loop waits meanwhile."""
+    first = max(0, bisect_right(rows, t0_ns, key=itemgetter(0)) - 1)
+    return list(islice(rows, first, bisect_left(rows, t1_ns, key=itemgetter(0)) + 1))
+
+
+def _columns(rows: list[tuple[float, ...]], width: int) -> tuple[IntArray, FloatArray]:
+    """Times (n,) and values (n, width)."""
+    values = np.array([row[1:] for row in rows], float).reshape(len(rows), width)
+    return np.array([row[0] for row in rows], np.int64), values

@@ -218,7 +218,7 @@ class LoopClock(Clock, Protocol):
     """Simulated time that a control loop leads: after a wait, what the devices sent until then is here."""
 
     def ask_ns(self) -> int:
-        """Time now [ns], also where it has gone on without the loop; by itself it does not."""
+        """Time now [ns], also where it has gone on without the loop; here the loop alone moves it."""
         return self.now_ns()
 
     def hurry(self) -> None:

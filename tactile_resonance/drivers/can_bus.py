@@ -19,6 +19,7 @@ from tactile_resonance.contact.interfaces import ForceError, ForceFault
 from tactile_resonance.fields import one_line
 
 OPEN_WITHIN_S = 3.5  # serial adapters are given two seconds to wake up
+LATE = f"not open after {OPEN_WITHIN_S:g} s"
 RATE_WINDOW_S = 0.5
 LEAST_SHARE = 0.9
 """Of the wrenches of a window that must arrive; fewer in two on end, and they pile up on the way."""
@@ -264,12 +265,13 @@ def open_bus(
     plain = set(settings) <= {"interface", "host", "port", "channel", "tcp_tune"}
     try:
         if settings["interface"] == "socketcand" and plain and request is None:
-            return SocketcandBus(settings["host"], settings["port"], settings["channel"])
+            try:
+                return SocketcandBus(settings["host"], settings["port"], settings["channel"])
+            except TimeoutError:
+                raise TimeoutError(LATE) from None
         return AnyBus(_opened(settings), request, look_s)
     except Exception as error:  # each interface has errors of its own
-        late = type(error) is TimeoutError  # of a socket or a thread, not of an interface
-        text = f"not open after {OPEN_WITHIN_S:g} s" if late else one_line(error)
-        raise ForceError(ForceFault.LINK_LOST, f"{where}: {text}") from error
+        raise ForceError(ForceFault.LINK_LOST, f"{where}: {one_line(error)}") from error
 
 
 def _opened(settings: dict[str, Any]) -> can.BusABC:
@@ -278,7 +280,7 @@ def _opened(settings: dict[str, Any]) -> can.BusABC:
     failed: list[Exception] = []
     given_up = threading.Event()
 
-    def open_bus() -> None:
+    def open_it() -> None:
         try:
             bus = can.Bus(**settings)
         except Exception as error:
@@ -288,14 +290,14 @@ def _opened(settings: dict[str, Any]) -> can.BusABC:
         if given_up.is_set():
             bus.shutdown()
 
-    opener = threading.Thread(target=open_bus, name="can_open", daemon=True)
+    opener = threading.Thread(target=open_it, name="can_open", daemon=True)
     opener.start()
     opener.join(OPEN_WITHIN_S)
     if failed:
         raise failed[0]
     if not opened:
         given_up.set()
-        raise TimeoutError
+        raise TimeoutError(LATE)
     return opened[0]
 
 

@@ -213,14 +213,13 @@ class UrArm:
 
     def catch_up(self, robot_ns: int) -> None:
         """Wait for the state that the bench has sent, of a time of the robot [ns]."""
-        states = self._reader
         self._looked_ns = 0
         self.receive(now_known=True)
-        while (newest := states.newest) is not None:
+        # another thread may connect anew meanwhile
+        while (newest := self._reader.newest) is not None:
             if round(newest.robot_time_s * 1e9) >= robot_ns:
                 return
-            with contextlib.suppress(ValueError):  # closed meanwhile, which the next look finds
-                select.select([states.stream], [], [], 0.1)
+            self._await_state(0.1)
             self.receive(now_known=True)
 
     def date_anew(self) -> None:
@@ -292,8 +291,13 @@ class UrArm:
         while not condition(states):
             if time.monotonic() > deadline:
                 raise ArmError(fault, otherwise)
-            select.select([states.stream], [], [], 0.05)
+            self._await_state(0.05)
             self.receive()
+
+    def _await_state(self, seconds: float) -> None:
+        """Return when something has come from the robot, after a time at the latest."""
+        with contextlib.suppress(ValueError):  # closed meanwhile, which the next look finds
+            select.select([self._reader.stream], [], [], seconds)
 
     def _check_stop(self) -> None:
         """Raise where something forbids motion whatever program runs."""

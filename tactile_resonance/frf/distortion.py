@@ -212,6 +212,10 @@ def nonlinear_distortion(
     Pintelon & Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed. (2012),
     chapter 4 (fast method, detection lines, correction for the input).
     """
+    if spectra.spectra.ndim < 3:
+        raise ValueError(
+            f"spectra: shape {spectra.spectra.shape}, expected (..., M, 2, H) with realisations M"
+        )
     excited = spectra.at(excited_harmonics)
     if np.any(excited.harmonics % 2 == 0):
         raise ValueError(
@@ -304,8 +308,8 @@ def _sentence(name: str, lines: DetectionLines) -> str:
 
 
 def decibel(power_ratio: npt.ArrayLike) -> FloatArray:
-    """10 lg of a power ratio."""
-    with np.errstate(divide="ignore"):  # nothing at all is minus infinity
+    """10 lg of a power or a ratio of powers; minus infinity for 0, NaN for what rounding made negative."""
+    with np.errstate(divide="ignore", invalid="ignore"):
         return 10 * np.log10(np.asarray(power_ratio, float))
 
 

@@ -118,12 +118,11 @@ class MeasurementFrf:
             self._samples = np.empty((2, excitation.periods, n))
             self._played = excitation
         played = self._played
-        if excitation.sample_rate_hz != played.sample_rate_hz or not np.array_equal(
-            excitation.harmonics, played.harmonics
-        ):
+        alike = (excitation.sample_rate_hz, n) == (played.sample_rate_hz, played.samples_per_period)
+        if not alike or not np.array_equal(excitation.harmonics, played.harmonics):
             raise ValueError(
-                f"realisation: {record.realisation + 1} was played at another rate or on other lines than "
-                "the first record, expected the same"
+                f"realisation: {record.realisation + 1} was played at another rate, with another period or on "
+                "other lines than the first record, expected the same"
             )
         self._remember(record)
         block = Spectrum.of(u.reshape(-1, n), y.reshape(-1, n))

@@ -112,7 +112,10 @@ class PeriodicSpectra:
         return np.asarray(self.harmonics * (sample_rate_hz / self.samples_per_period), float)
 
     def at(self, harmonics: npt.ArrayLike) -> PeriodicSpectra:
-        """Some of the lines; all of them must be there."""
+        """Some of the lines; ``ValueError`` unless all of them are there."""
+        missing = np.setdiff1d(harmonics, self.harmonics)
+        if missing.size:
+            raise ValueError(f"harmonics: {missing[:5].tolist()} are not among the lines of these spectra")
         where = np.searchsorted(self.harmonics, harmonics)
         return replace(
             self,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import replace
 
 from geometry_msgs.msg import PoseStamped
@@ -28,6 +29,7 @@ ANSWER_WITHIN_S = 0.25
 """Longest time for which a record waits for its force, on the machine's clock; not in simulated time [s]."""
 DISCOVERED_WITHIN_S = 10.0
 """In simulated time a node that has just come up, and is not known to all yet, is waited for so long [s]."""
+POLL_S = 5e-4
 
 
 def make_contact_source(node: ManagedNode) -> MeasuredContact | PublishedPlace:
@@ -45,7 +47,11 @@ class MeasuredContact:
 
     def over(self, start_ns: int, end_ns: int) -> Contact:
         """Contact from one ROS time to another [ns]; with a reason where the force is unknown."""
-        if not self._client.wait_for_service(min(self._within_s, DISCOVERED_WITHIN_S)):
+        deadline = time.monotonic() + min(self._within_s, DISCOVERED_WITHIN_S)
+        # rclpy's own wait looks four times a second
+        while not self._client.service_is_ready() and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        if not self._client.service_is_ready():
             return Contact(reason=f"no node serves {self._client.srv_name}")
         request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))
         answered = threading.Event()

@@ -228,6 +228,7 @@ class SimulatedTip:
 
     def place(self, stay: Stay) -> None:
         """Put the tip somewhere; in air where its force is 0."""
+        stay = replace(stay, pose=stay.pose_at(stay.since_ns))
         point = stay.pose.pose.position
         tissue = self._laid.tissue_at(np.array([point.x, point.y, point.z]))
         self._put(stay, BenchTip(tissue if stay.force_n else None, stay.force_n, 1.0))

@@ -183,12 +183,12 @@ class JointPlan(FitPlan):
         if u.shape == y.shape:
             return u, y
         try:
-            u, y = np.broadcast_arrays(u, y)
+            shape = np.broadcast_shapes(u.shape, y.shape)
         except ValueError:
             raise ValueError(
                 f"y: shape {y.shape}, expected leading axes like those of u, {u.shape}"
             ) from None
-        return u, y
+        return np.broadcast_to(u, shape), np.broadcast_to(y, shape)
 
     @cached_property
     def bins(self) -> IntArray:

@@ -68,7 +68,7 @@ EXACT, LINEAR, LINEAR_UNWEIGHTED = 0, 1, 2
 TINY = float(np.finfo(float).tiny)
 MOST_INVERTED = 1 / float(np.finfo(float).eps)
 """Condition of a matrix of which rounding leaves nothing of the inverse."""
-# The last step is one that the next one would be so many standard deviations of, as the residuals show them.
+# A step is the last one where the next would be smaller than so many deviations, as the residuals show them.
 STEP_TOLERANCE = 1e-2
 # Rounding of a residual relative to the data it is the residual of.
 ROUNDING = 1e-14
@@ -120,7 +120,7 @@ class Solution(NamedTuple):
         those of Y only after this, for the phases of the excitation are random.
     converged : (points,) bool
     normal : (points, M, 2, n, n) float
-        ``Re J^H J`` of undriven and of driven bins, where the last step began; empty of single records.
+        ``Re J^H J`` of undriven and of driven bins, where the last step began; empty for single records.
     marginal : (points, M, n, n) float
         Blocks of the inverse of the normal matrix: of the coefficients that records share and those of one;
         NaN where it is singular or not finite.

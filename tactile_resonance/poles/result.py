@@ -166,7 +166,8 @@ class Poles:
         """(n, 2, 2) of (Re, Im) of each residue [rad^2/s^2], from noise; None where unknown."""
         if self.fit is None or self.coefficient_covariance is None or not self.f0_hz.size:
             return None
-        return self.fit.residue_covariance(self.poles_rad_s, self.coefficient_covariance)
+        with np.errstate(all="ignore"):
+            return self.fit.residue_covariance(self.poles_rad_s, self.coefficient_covariance)
 
     @property
     def zeros_rad_s(self) -> ComplexArray:
@@ -180,7 +181,8 @@ class Poles:
         """(k, 2, 2) of (Re, Im) of each zero [rad^2/s^2], from noise; None where unknown."""
         if self.fit is None or self.coefficient_covariance is None:
             return None
-        return self.fit.zero_covariance(self.zeros_rad_s, self.coefficient_covariance)
+        with np.errstate(all="ignore"):
+            return self.fit.zero_covariance(self.zeros_rad_s, self.coefficient_covariance)
 
     def noting(self, *notes: str) -> Poles:
         """Return these poles with notes added to the message; empty notes are left out."""

@@ -275,18 +275,20 @@ def _values(message: Any, names: Iterable[str]) -> dict[str, Any]:
 
 
 def write_values(message: M, names: Iterable[str], source: object, prefix: str = "") -> M:
-    """Write what an object has under these names to the fields so called behind a prefix; return the message.
+    """Write what an object has under these names to the fields of the same names after a prefix; return it.
 
     Numbers of numpy become those of Python, which alone rclpy takes; where the object has None, an array stays
     empty and a number is NaN.
     """
     for name in names:
         value, target = getattr(source, name), getattr(message, prefix + name)
-        if isinstance(target, array.array):
-            if value is not None:
+        if isinstance(target, (array.array, np.ndarray)):
+            if value is None:
+                continue
+            if isinstance(target, array.array):
                 fill(target, value)
-        elif isinstance(target, np.ndarray):
-            setattr(message, prefix + name, value)
+            else:
+                setattr(message, prefix + name, value)
         else:
             kind = type(target)
             setattr(message, prefix + name, kind(math.nan if value is None else value))

@@ -52,11 +52,12 @@ def _scripts() -> tuple[str, str]:
     """Both scripts as elements of HTML, and their hashes as a Content-Security-Policy takes them."""
     try:
         plotly = resources.files("plotly") / "package_data" / "plotly.min.js"
-        texts = (plotly.read_text(encoding="utf-8"), _asset("page.js"))
+        library = plotly.read_text(encoding="utf-8")
     except (ModuleNotFoundError, FileNotFoundError) as error:
         raise ValueError(
             f"report: plotly.js was not found ({error}); the page needs 'pip install plotly'"
         ) from error
+    texts = (library, _asset("page.js"))
     digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in texts)
     return (
         "".join(f"<script>{text}</script>" for text in texts),

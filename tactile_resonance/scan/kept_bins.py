@@ -139,8 +139,13 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         ]
         rows = [Rows.of(path, f"points_{k}") for k in range(len(kinds))]
     except (
-        *(ValueError, KeyError, TypeError, EOFError, NotImplementedError),
-        *(zipfile.BadZipFile, struct.error),
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        NotImplementedError,
+        zipfile.BadZipFile,
+        struct.error,
     ):  # damaged: it is made again
         return None
     within = low_hz <= band_hz[0] and band_hz[1] <= high_hz

@@ -184,7 +184,7 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
 
 
 def _design_in_air(scene: ScanScene) -> MeasurementDesign:
-    """Of a calibrated sensor, as without a calibration; ValueError where its short blocks do not do."""
+    """Of a calibrated sensor, as without a calibration; ValueError where its blocks hold too little."""
     use = scene.sensor
     wanted = [output.value for output in scene.outputs if output in (Output.DISTORTION, Output.FRF)]
     accepted = "none of distortion, frf with sensor.calibrated: only lines of the band are excited"

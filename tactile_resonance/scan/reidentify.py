@@ -290,7 +290,7 @@ def _as_csv(rows: npt.NDArray, run: str) -> str:
 
 
 class _Processes:
-    """One a core, which end with the context whatever happens."""
+    """One a core, which end with the context; after an error all children born meanwhile do."""
 
     def __init__(self) -> None:
         self._count = len(os.sched_getaffinity(0))

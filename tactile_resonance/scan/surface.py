@@ -109,6 +109,11 @@ class HeightField(Surface):
         """(..., 3) unit normal, NaN outside of the grid."""
         return unit_normal(self._evaluate(xy_m, dx=1), self._evaluate(xy_m, dy=1))
 
+    def known(self, xy_m: npt.ArrayLike) -> BoolArray:
+        """(...) inside of the grid."""
+        x, y = np.moveaxis(np.asarray(xy_m, float), -1, 0)
+        return (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
+
     @cached_property
     def _spline(self) -> RectBivariateSpline:
         orders = [min(3, axis.size - 1) for axis in (self.x_m, self.y_m)]
@@ -116,8 +121,7 @@ class HeightField(Surface):
 
     def _evaluate(self, xy_m: npt.ArrayLike, dx: int = 0, dy: int = 0) -> FloatArray:
         x, y = np.moveaxis(np.asarray(xy_m, float), -1, 0)
-        inside = (x >= self.x_m[0]) & (x <= self.x_m[-1])
-        inside &= (y >= self.y_m[0]) & (y <= self.y_m[-1])
+        inside = self.known(xy_m)
         value = self._spline.ev(np.where(inside, x, self.x_m[0]), y, dx=dx, dy=dy)
         return np.where(inside, value, np.nan)
 

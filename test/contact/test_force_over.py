@@ -332,16 +332,16 @@ def test_nothing_is_added_while_another_thread_asks(monkeypatch):
     adding = threading.Thread(
         target=record.add, args=(sample.time_ns, [sample], ZERO, None), kwargs={"valid": True}
     )
-    around = force_over._around
+    cut = force_over._cut
 
     def asked(rows, *interval):
         if rows is record._forces:
             adding.start()
             adding.join(0.2)
             assert adding.is_alive()
-        return around(rows, *interval)
+        return cut(rows, *interval)
 
-    monkeypatch.setattr(force_over, "_around", asked)
+    monkeypatch.setattr(force_over, "_cut", asked)
     assert record.over(BEGAN_NS + 100 * MS, int(times[-1])).force_n == pytest.approx(
         0.01, rel=1e-12
     )

@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from cell_bench import HOST, STEP_NS, CellBench, cell_config  # noqa: E402
 
 from tactile_resonance.drivers import can_wrench  # noqa: E402
+from tactile_resonance.drivers.can_bus import open_bus  # noqa: E402
 from tactile_resonance.drivers.can_wrench import CanWrench  # noqa: E402
 from tactile_resonance.simulation.cell.tcp_bus import QUIET_S  # noqa: E402
 
@@ -368,6 +369,15 @@ def test_a_server_that_dies_is_a_lost_link_and_another_in_its_place_is_found(mon
     finally:
         source.close()
         second.kill()
+
+
+def test_a_time_limit_of_the_interface_itself_keeps_its_words(monkeypatch):
+    def no_answer(**settings):
+        raise TimeoutError("adapter did not acknowledge")
+
+    monkeypatch.setattr(can, "Bus", no_answer)
+    with pytest.raises(ForceError, match="cell: adapter did not acknowledge"):
+        open_bus({"interface": "slcan", "channel": "x"}, "cell", None, 0.1)
 
 
 def test_a_server_that_says_nothing_does_not_hold_up_the_start():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import io, signal
 
-from tactile_resonance.frf.distortion import nonlinear_distortion
+from tactile_resonance.frf.distortion import decibel, nonlinear_distortion
 from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
 from tactile_resonance.multisine import Grid, harmonics_on_grid
@@ -176,3 +176,14 @@ def test_refusals(multisine):
         nonlinear_distortion(spectra, [1, 2, 3], sample_rate_hz=1.0)
     with pytest.raises(ValueError, match="only excited harmonics"):
         nonlinear_distortion(spectra.at(EXCITED), EXCITED, sample_rate_hz=1.0)
+    with pytest.raises(ValueError, match=r"harmonics: \[\d+.*\] are not among the lines"):
+        spectra.at([int(ALL[-1]) + 2])
+    alone = averaged_spectra(Spectrum.of(u[0], y[0]), ALL)
+    with pytest.raises(ValueError, match="with realisations M"):
+        nonlinear_distortion(alone, EXCITED, sample_rate_hz=1.0)
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_nothing_there_are_no_decibels():
+    assert decibel([1.0, 0.0, 100.0]).tolist() == [0.0, -np.inf, 20.0]
+    assert np.isnan(decibel(-1e-20))  # what rounding leaves of a variance of exact data

@@ -264,9 +264,13 @@ def test_realisations_on_other_lines_are_refused(channels):
     measurement.add(record(u[0, 0], y[0, 0], 0, 0), excitation(0))
     other = excitation(1)
     few = {name: getattr(other, name)[1:] for name in ("harmonics", "amplitude_v", "phase_rad")}
+    said = "realisation: 2 was played at another rate, with another period or on other lines"
     for changed in (replace(other, **few), replace(other, sample_rate_hz=2 * RATE_HZ)):
-        with pytest.raises(ValueError, match="realisation: 2 was played at another rate or on other"):
+        with pytest.raises(ValueError, match=said):
             measurement.add(record(u[1, 0], y[1, 0], 1, 0), changed)
+    twice = replace(record(u[1, :2], y[1, :2], 1, 0), samples_per_period=2 * N)
+    with pytest.raises(ValueError, match=said):
+        measurement.add(twice, replace(other, samples_per_period=2 * N))
     assert measurement.add(record(u[1, 0], y[1, 0], 1, 0), other).realisations == 2
 
 

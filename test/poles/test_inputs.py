@@ -148,6 +148,15 @@ def test_leading_axes_that_do_not_fit_are_named():
         plan.from_bins(np.zeros((3, plan.bins.size)), np.zeros((2, plan.bins.size)))
 
 
+@pytest.mark.filterwarnings("error")
+def test_one_input_of_many_outputs_needs_no_axis():
+    plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), BARE)
+    u, y = plan.transform(*record())
+    alone = plan.from_bins(u, y)
+    for found in (plan.from_bins(u, y[None]), plan.from_bins(u[None], y)):
+        assert found.f0_hz[0] == alone.f0_hz
+
+
 def test_harmonics_kept_with_bins_are_whole_too():
     plan = JointPlan(RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200, 300), BARE)
     u, y = (x[None] for x in plan.transform(*record()))

@@ -56,7 +56,7 @@ class LoadCell:
     Attributes
     ----------
     faults : CellFaults
-        May be set at any time.
+        Its fields may be set at any time.
     streaming : bool
     """
 

@@ -57,7 +57,7 @@ class OnSoft(ABC):
 
     @abstractmethod
     def _act(self, up_m_s: float) -> float:
-        """Force of what else acts [N], where the tissue has stepped and the ball went up at a speed."""
+        """Force of what else acts [N], after a step of the tissue in which the ball rose with a speed."""
 
     @abstractmethod
     def _ahead(self, dt_s: float) -> tuple[float, float]:
