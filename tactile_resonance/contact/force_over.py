@@ -141,7 +141,7 @@ class ForceRecord:
         zero_n, forces, poses = bias_n[2], self._forces, self._poses
         with self._lock:
             self._now_ns = time_ns
-            # what is told again is left out
+            # a source may repeat its newest wrench: each counts once
             newest_ns = forces[-1][0] if forces else -math.inf
             for heard_ns, force_n, _, overload in wrenches:
                 if heard_ns > newest_ns:

@@ -341,7 +341,14 @@ def test_nothing_is_added_while_another_thread_asks(monkeypatch):
             assert adding.is_alive()
         return cut(rows, *interval)
 
+    columns = force_over._columns
+
+    def made(rows, width):
+        assert not record._lock.locked()  # the control loop waits for it
+        return columns(rows, width)
+
     monkeypatch.setattr(force_over, "_cut", asked)
+    monkeypatch.setattr(force_over, "_columns", made)
     assert record.over(BEGAN_NS + 100 * MS, int(times[-1])).force_n == pytest.approx(
         0.01, rel=1e-12
     )

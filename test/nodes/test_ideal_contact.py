@@ -358,7 +358,7 @@ def test_in_simulated_time_a_contact_takes_its_time_and_no_other():
         assert result.reached
         assert result.total_s == pytest.approx(CONTACT_S, abs=0.002)  # a step of the bench
         assert (after_ns - before_ns) * 1e-9 == pytest.approx(CONTACT_S, abs=0.004)
-        placed = ideal.node._touch.stays.newest.pose  # with which the truth is told, whenever the goal was made
+        placed = ideal.node._touch.stays.newest.pose  # the pose that `bench/truth` publishes
         assert before_ns < time_from_message(placed.header.stamp) <= after_ns
         told = ideal.force_over(after_ns, after_ns + SECOND_NS // 10)
         assert told.force_n == FORCE_N

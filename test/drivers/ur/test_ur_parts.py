@@ -3,7 +3,9 @@
 
 import itertools
 import json
+import socket
 import tempfile
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.rtde_stream import RobotState
+from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.drivers.ur_exchange import (
     FRESH,
@@ -317,3 +320,28 @@ def test_what_the_library_raises_for_want_of_an_answer_is_a_lost_link(silent):
     with pytest.raises(ArmError, match=rf"127.0.0.1: {silent}\(\) function did not succeed!") as error:
         session.restart()
     assert error.value.fault is ArmFault.LINK_LOST
+
+
+class Reader:
+    """Of the robot's states, of which no further one comes."""
+
+    def __init__(self, robot_time_s):
+        self.newest, self.reads = SimpleNamespace(robot_time_s=robot_time_s), 0
+        self.stream, self._other = socket.socketpair()
+
+    def read(self, now_known):
+        self.reads += 1
+        return False
+
+
+def test_a_wait_for_a_state_goes_on_with_the_reader_of_a_new_connection():
+    """Another thread connects anew meanwhile: the former reader never has the state that is waited for."""
+    arm, former, later = UrArm(UrArmConfig("127.0.0.1")), Reader(1.0), Reader(3.0)
+    arm._states = former
+    waits = threading.Thread(target=arm.catch_up, args=(2_000_000_000,), daemon=True)
+    waits.start()
+    former.stream.close()
+    arm._states = later
+    waits.join(10.0)
+    assert not waits.is_alive()
+    assert later.reads < 3  # not without a pause

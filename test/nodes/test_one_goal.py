@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Goals of scan_node, of which one at a time is worked at."""
+
+import asyncio
+import contextlib
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+
+from tactile_resonance.nodes import scan_node
+
+
+class Node:
+    """Keeps what an action is served by."""
+
+    def __init__(self, active):
+        self.active = active
+
+    def serve(self, *_):
+        pass
+
+    def act(self, kind, name, serve, on_cancel, refuses):
+        self.goal, self.refuses = serve, refuses
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_a_goal_accepted_as_the_node_is_deactivated_is_cancelled_at_once(monkeypatch, active):
+    """`deactivate` cancels what is under way: a goal that has not begun yet has no controls to be found by."""
+
+    async def here(node, work, name):
+        return work()
+
+    monkeypatch.setattr(scan_node, "in_thread", here)
+    monkeypatch.setattr(scan_node, "end_goal", lambda goal, done: None)
+    node = Node(active=True)
+    goals = scan_node.OneGoal(node, contextlib.nullcontext)
+    monkeypatch.setattr(goals, "_require_free", lambda: None)
+    cancelled = []
+
+    def work(goal, checked):
+        cancelled.append(goals.controls.cancelled.is_set())
+        return SimpleNamespace(outcome=0)
+
+    async def check(message):
+        return "checked"
+
+    goals.act(object, "scan", check, work, 0, None)
+    request = SimpleNamespace()
+    assert not asyncio.run(node.refuses(request))
+    node.active = active
+    asyncio.run(node.goal(SimpleNamespace(request=request, is_cancel_requested=False)))
+    assert cancelled == [not active]
