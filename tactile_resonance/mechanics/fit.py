@@ -24,10 +24,14 @@ from scipy.special import fdtrc
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
-from tactile_resonance.mechanics.course import layer_share, sphere_share
+from tactile_resonance.mechanics.course import (
+    SeriesProblem,
+    SeriesSolution,
+    layer_share,
+    sphere_share,
+)
 from tactile_resonance.mechanics.indentation import IndentationRecord, means_of
 from tactile_resonance.mechanics.prony import Prony
-from tactile_resonance.mechanics.series_problem import SeriesProblem, SeriesSolution
 
 MOST_TERMS = 4
 SHOWN, SURE = 2.5, 2.0
