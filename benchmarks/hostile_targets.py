@@ -18,8 +18,12 @@ import scipy.io
 from benchmarks.hostile_run import BAND_HZ, make_run
 from tactile_resonance.array_files import read_arrays
 from tactile_resonance.bringup import read_parameter_file
-from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
-from tactile_resonance.calibration.model import Calibration, SensorModel
+from tactile_resonance.calibration.model import (
+    CalibratedSensor,
+    Calibration,
+    SensorModel,
+    read_calibration,
+)
 from tactile_resonance.commands.analyze import parse_harmonics, parse_order, parse_segments
 from tactile_resonance.commands.mechanics import COLUMNS
 from tactile_resonance.configuration import share_path

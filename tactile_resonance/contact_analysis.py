@@ -13,7 +13,7 @@ import numpy as np
 from tactile_resonance.analysis import Analysis, analyse, analysis_as_json
 from tactile_resonance.calibration.contact import ContactStatus, Law, Moduli, TissueContact, moduli
 from tactile_resonance.calibration.estimator import CalibratedEstimator, ContactRecord
-from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
+from tactile_resonance.calibration.model import CalibratedSensor, read_calibration
 from tactile_resonance.fields import band, known, number, require, require_kind
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
@@ -90,7 +90,7 @@ def estimate_contact(
 
     >>> import numpy as np
     >>> import tactile_resonance as tr
-    >>> from tactile_resonance.calibration.file import CalibratedSensor
+    >>> from tactile_resonance.calibration.model import CalibratedSensor
     >>> from tactile_resonance.calibration.model import Calibration
     >>> from tactile_resonance.calibration.model import SensorModel
     >>> model = SensorModel.of_values(

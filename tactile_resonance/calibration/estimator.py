@@ -312,16 +312,10 @@ class _Fit:
         residual, jacobian = self.residual(p), slope_of(self.residual, p)
         covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
         sensor = self.calibration.model
-        std = self.calibration.std
-        free = np.flatnonzero(std > 0)
-        moved = np.tile(sensor.values, (free.size, 1))  # one parameter by its deviation each
-        moved[np.arange(free.size), free] += std[free]
-        stack = SensorModel.of_values(moved)
-        stacked = np.tile(p, (free.size, 1))
+        stack, correlation = self.calibration.one_moved_each()
+        stacked = np.tile(p, (len(correlation), 1))
         change = (self.residual(stacked, stack) - residual).T  # (R, free)
         by_sensor = -covariance @ jacobian.T @ change  # (4, free), per deviation
-        scale = np.outer(std[free], std[free])
-        correlation = self.calibration.covariance[np.ix_(free, free)] / scale
         total = covariance + by_sensor @ correlation @ by_sensor.T
         # of the mode that is meant: nearest to that of the band in air, which tissue moves by a tenth
         poles = sensor.poles(self.prior.stiffness(p))

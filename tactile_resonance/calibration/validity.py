@@ -15,7 +15,7 @@ import numpy as np
 from scipy import special
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.calibration.model import AIR, Calibration, SensorModel
+from tactile_resonance.calibration.model import AIR, Calibration
 from tactile_resonance.fields import require
 from tactile_resonance.poles.result import natural_frequency_and_damping
 
@@ -63,20 +63,17 @@ class Validity:
 
 def poles_in_air(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
     """(n, 2) f0 [Hz] and damping ratio of all modes in air, and their covariance (n, 2, 2)."""
-    model, free = calibration.model, np.flatnonzero(calibration.std > 0)
-    std = calibration.std[free]
-    moved = np.tile(model.values, (free.size + 1, 1))
-    moved[np.arange(free.size), free] += std
-    poles = SensorModel.of_values(moved).poles(AIR)  # (free + 1, N)
-    own = poles[-1][poles[-1].imag > 0]
+    stack, correlation = calibration.one_moved_each()
+    poles, own = stack.poles(AIR), calibration.model.poles(AIR)  # (free, N), (N,)
+    own = own[own.imag > 0]
     own = own[np.argsort(np.abs(own))]
     near = np.argmin(np.abs(poles[:, None, :] - own[:, None]), axis=-1)
-    each = np.take_along_axis(poles[:, None, :], near[..., None], axis=-1)[..., 0]
-    f0_hz, damping = natural_frequency_and_damping(each)  # (free + 1, n)
-    values = np.stack([f0_hz, damping], axis=-1)
-    slope = values[:-1] - values[-1]  # (free, n, 2), per deviation
-    correlation = calibration.covariance[np.ix_(free, free)] / np.outer(std, std)
-    return values[-1], np.einsum("ina,ij,jnb->nab", slope, correlation, slope)
+    moved = np.take_along_axis(poles[:, None, :], near[..., None], axis=-1)[..., 0]  # (free, n)
+    values, of_moved = (
+        np.stack(natural_frequency_and_damping(each), axis=-1) for each in (own, moved)
+    )
+    slope = of_moved - values  # (free, n, 2), per deviation
+    return values, np.einsum("ina,ij,jnb->nab", slope, correlation, slope)
 
 
 def check_in_air(

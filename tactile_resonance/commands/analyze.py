@@ -19,7 +19,7 @@ from tactile_resonance.analysis import (
     analyse,
     analysis_as_json,
 )
-from tactile_resonance.calibration.file import read_calibration
+from tactile_resonance.calibration.model import read_calibration
 from tactile_resonance.calibration.validity import as_of_today
 from tactile_resonance.commands.options import add_band, add_figure, add_file, add_output
 from tactile_resonance.contact_analysis import ContactAnalysis, contact_content, estimate_contact

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
-from tactile_resonance.calibration.file import read_calibration
+from tactile_resonance.calibration.model import read_calibration
 from tactile_resonance.commands.options import ProgressBar, add_file, require_packages
 from tactile_resonance.fields import counted, require
 from tactile_resonance.processes import (

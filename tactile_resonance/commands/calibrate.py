@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
 from tactile_resonance.calibration.fit import Fitted, calibrate
-from tactile_resonance.calibration.model import Calibration
+from tactile_resonance.calibration.model import CalibratedSensor, Calibration, read_calibration
 from tactile_resonance.calibration.records import CalibrationRecord, Load
 from tactile_resonance.calibration.validity import check_in_air, poles_in_air
 from tactile_resonance.cantilever import tip_mass

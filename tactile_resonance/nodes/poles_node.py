@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tactile_resonance import msg
 from tactile_resonance.calibration.estimator import CalibratedEstimator, calibrated_poles
-from tactile_resonance.calibration.file import read_calibration
+from tactile_resonance.calibration.model import read_calibration
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import frf_from_message, poles_to_message

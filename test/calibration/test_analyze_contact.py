@@ -10,7 +10,7 @@ from calibration.played import contact_of, run_on
 
 import tactile_resonance as tr
 from benchmarks.calibrate_benches import BAND_HZ, excitation
-from tactile_resonance.calibration.file import CalibratedSensor
+from tactile_resonance.calibration.model import CalibratedSensor
 from tactile_resonance.cli import main
 from tactile_resonance.simulation.sensor.bimorph import couple
 

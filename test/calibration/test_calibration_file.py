@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_resonance.calibration.file import CalibratedSensor, read_calibration
+from tactile_resonance.calibration.model import CalibratedSensor, read_calibration
 from tactile_resonance.cantilever import tip_mass
 from tactile_resonance.cli import main
 

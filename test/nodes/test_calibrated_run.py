@@ -14,8 +14,7 @@ from dataclasses import replace
 
 from rclpy.serialization import serialize_message
 
-from tactile_resonance.calibration.file import CalibratedSensor
-from tactile_resonance.calibration.model import Calibration
+from tactile_resonance.calibration.model import CalibratedSensor, Calibration
 from tactile_resonance.cli import main
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.nodes.messages import (

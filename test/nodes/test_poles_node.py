@@ -236,8 +236,7 @@ def test_bins_of_two_realisations_give_what_their_records_give(node, monkeypatch
 
 def test_a_calibrated_sensor_is_read_and_used(tmp_path, monkeypatch):
     """The pole of a block of 20 ms from rest; a file that is none keeps the node from being configured."""
-    from tactile_resonance.calibration.file import CalibratedSensor
-    from tactile_resonance.calibration.model import Calibration
+    from tactile_resonance.calibration.model import CalibratedSensor, Calibration
     from tactile_resonance.frf.measurement import MeasurementFrf
     from tactile_resonance.poles.structure import PoleBand
     from tactile_resonance.simulation.sensor.bench import SimulatedBench
