@@ -69,11 +69,15 @@ def report_run(folder: Path) -> int:
     from tactile_resonance.front import read_run
 
     content = read_run(folder)
-    from tactile_resonance.report.boundary import FILE, boundary_of_run
     from tactile_resonance.report.drawing import figure_bytes
-    from tactile_resonance.report.map_recording import write_map_recording
     from tactile_resonance.report.point_details import details_of, truths_of
-    from tactile_resonance.report.pole_map_figure import draw_pole_map
+    from tactile_resonance.report.run_map import (
+        BOUNDARY,
+        RECORDING,
+        boundary_of_run,
+        draw_pole_map,
+        write_map_recording,
+    )
     from tactile_resonance.report.run_report import (
         as_page,
         pole_maps_of,
@@ -98,7 +102,7 @@ def report_run(folder: Path) -> int:
     page = as_page(content, pole_maps, pictures, details, truths, boundary)
     write_whole(folder / "report.html", page.encode())
     if boundary is not None:
-        write_whole(folder / FILE, boundary.as_json().encode())
+        write_whole(folder / BOUNDARY, boundary.as_json().encode())
     if content.latest:
         print(point_table(content.latest, truths))
         print("\n".join(table_notes(content.latest, truths)))
@@ -111,9 +115,9 @@ def report_run(folder: Path) -> int:
     if content.unchecked:
         print(not_checked(content.unchecked))
     drawn = ["report.html", *map_names(len(pole_maps))]
-    drawn += [] if boundary is None else [FILE]
+    drawn += [] if boundary is None else [BOUNDARY]
     if pole_maps:
         write_map_recording(content)  # last: the page and the table do not wait for it
-        drawn.append("map.mcap")
+        drawn.append(RECORDING)
     print(f"{', '.join(drawn)} in {folder}")
     return 0

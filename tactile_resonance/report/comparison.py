@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import counted
 from tactile_resonance.report import run_tables as tables
-from tactile_resonance.report.boundary import boundary_of_run
 from tactile_resonance.report.page import HIGH, LOW, MM, listed, page, page_data
 from tactile_resonance.report.point_details import MOST_DETAILED, details_of
+from tactile_resonance.report.run_map import boundary_of_run
 from tactile_resonance.report.run_report import (
     median_std,
     pole_maps_of,

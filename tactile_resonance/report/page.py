@@ -31,7 +31,7 @@ from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, MapSurface
 
 if TYPE_CHECKING:
-    from tactile_resonance.report.boundary import RunBoundary
+    from tactile_resonance.report.run_map import RunBoundary
     from tactile_resonance.scan.tissue_tests import TissueTest
 
 MM, MN = 1e3, 1e3

@@ -35,7 +35,7 @@ from tactile_resonance.strict_yaml import parse_yaml
 from tactile_resonance.tissue.classify import UNKNOWN
 
 if TYPE_CHECKING:
-    from tactile_resonance.report.boundary import RunBoundary
+    from tactile_resonance.report.run_map import RunBoundary
 
 # Facts of the run that have a place of their own on the page.
 _SHOWN = {"skipped", "notes", "surface"}

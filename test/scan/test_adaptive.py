@@ -10,7 +10,7 @@ import pytest
 import yaml
 from scipy.spatial.distance import cdist
 
-from tactile_resonance.report.boundary import boundary_of_run
+from tactile_resonance.report.run_map import boundary_of_run
 from tactile_resonance.scan.adaptive import WantedMap
 from tactile_resonance.scan.level_set import boundary_of, difference_m2
 from tactile_resonance.scan.plan import make_plan

@@ -8,9 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.report import map_recording
-from tactile_resonance.report.boundary import boundary_of_run
-from tactile_resonance.report.map_recording import write_map_recording
+from tactile_resonance.report import run_map
+from tactile_resonance.report.run_map import boundary_of_run, write_map_recording
 from tactile_resonance.scan.map_messages import CLOUD, MARKERS, POINT
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_file import read_content, read_messages
@@ -130,7 +129,7 @@ def test_late_readers_get_the_map_of_a_file_that_is_played(folder):
 
 @pytest.mark.parametrize(("bound", "most"), [("MOST_STATES", 2), ("MOST_DRAWN", 2 * 4)])
 def test_a_long_run_is_drawn_at_some_points_and_at_the_last(folder, monkeypatch, bound, most):
-    monkeypatch.setattr(map_recording, bound, most)
+    monkeypatch.setattr(run_map, bound, most)
     path = write_map_recording(read_run(folder))  # in place of the one before
     assert [cloud.width for _, cloud in told(path, "/pole_map")] == [2, 2]  # of four
     crosses = told(path, "/pole_map/markers")[-1][1].markers[1]
