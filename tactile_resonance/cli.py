@@ -16,8 +16,7 @@ from tactile_resonance.processes import ENDING
 
 COMMANDS = (
     *("plan", "bench_scan", "live", "analyze", "reidentify", "calibrate", "references"),
-    *("compare", "mechanics", "report", "figures", "benchmark", "calibrate_table", "simulate"),
-    *("check_robot", "compile"),
+    *("mechanics", "report", "benchmark", "calibrate_table", "simulate", "first_use"),
 )
 """Modules of `commands`, in the order in which help lists them."""
 

@@ -1,18 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`tactile_resonance check-robot`: whether a robot is ready and its link fit for contact. Moves nothing."""
+"""`tactile_resonance check-robot` and `compile`: what is done once, before a robot and fits are first used."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+from importlib import import_module
 from importlib.util import find_spec
 
 from tactile_resonance.commands.options import add_file
 from tactile_resonance.fields import require
 
+STEPPED = tuple(
+    f"tactile_resonance.{name}"
+    for name in (
+        *("contact.contact_filter", "simulation.cell.transducer", "simulation.tissue.indenter"),
+        *(f"simulation.ur5e.{name}" for name in ("forces", "kinematics", "poses", "tracking")),
+    )
+)
+"""Modules of what is stepped hundreds of times a second, compiled as they are imported."""
+
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Options of the command."""
+    """Options of both commands."""
     parser = commands.add_parser(
         "check-robot",
         help="whether a Universal Robots arm is ready and its link fit",
@@ -25,10 +35,18 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     add_file(parser, "--config", "default: config/devices/ur5e.yaml")
     parser.add_argument("--seconds", type=float, default=5.0, help="to watch (default: 5)")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_check_robot)
+    parser = commands.add_parser(
+        "compile",
+        help="compile fits, contact control and the simulated robot ahead of their first use",
+        description="Compile the fits of poles and mechanical tests, the filter of contacts and what a "
+        "simulated robot steps into numba's cache, which takes about a minute and is done once per "
+        "installation. 'make setup' does it; after 'pip install' or colcon the first use does it otherwise.",
+    )
+    parser.set_defaults(run=_compile)
 
 
-def run(options: argparse.Namespace) -> int:
+def _check_robot(options: argparse.Namespace) -> int:
     """Print what was found; status 1 where the link does not serve."""
     require(0.5 <= options.seconds <= 3600, "--seconds", options.seconds, "0.5 to 3600")
     if find_spec("rtde_control") is None:
@@ -53,3 +71,23 @@ def run(options: argparse.Namespace) -> int:
         return 1
     print("fit: no state came too late")
     return 0
+
+
+def _compile(options: argparse.Namespace) -> int:
+    """Compile what is not in the cache yet."""
+    # only here: numba takes a second to load
+    from tactile_resonance.mechanics import course
+    from tactile_resonance.poles import compiled
+
+    missing = compiled.compiled() + course.compiled() + sum(map(_compiled, STEPPED))
+    print(f"fits: {missing} kernels compiled" if missing else "fits: compiled already")
+    return 0
+
+
+def _compiled(name: str) -> int:
+    """How many functions of a module were not in the cache and had to be compiled."""
+    from numba.core.dispatcher import Dispatcher
+
+    members = vars(import_module(name)).values()
+    kernels = [each for each in members if isinstance(each, Dispatcher)]
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels)
