@@ -86,8 +86,7 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
     start = start_in_air(air[0], gain, delay, modes)
 
     def without_loads(start: SensorModel, steps: int) -> tuple[SensorModel, float]:
-        problem = _Records([*air, *loopback], start.modes, free_gain=bool(loopback), free_tip=False)
-        solved = problem.solved(start, steps)
+        solved = _Records([*air, *loopback], start.modes).solved(start, steps)
         return SensorModel.of_values(solved.values), float(np.sum(solved.residual**2))
 
     first, squares = without_loads(start, MOST_STEPS)
@@ -98,7 +97,7 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
         first = further
     if loaded:
         first = replace(first, tip_deflection=start_tip(loaded, first, shown))
-    problem = _Records(records, first.modes, free_gain=bool(loopback), free_tip=bool(loaded))
+    problem = _Records(records, first.modes)
     begun = problem.solved(first)
     # what repeats in every period, as the steps of a converter do, no variance over periods shows
     squares_of = [np.mean(part**2) for part in problem.parts(begun.residual)]
@@ -106,7 +105,7 @@ def calibrate(records: Sequence[CalibrationRecord], modes: int | None = None) ->
     problem.widen(excess)
     contradiction = problem.widen_loads(begun)
     solved = problem.solved(SensorModel.of_values(begun.values))
-    return _fitted(problem, solved, excess, contradiction, bool(loopback))
+    return _fitted(problem, solved, excess, contradiction)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,24 +118,21 @@ class _Solved:
 
 
 class _Records:
-    """Residuals and their derivatives by logarithms of what is above 0, and by the others in their units."""
+    """Residuals and their derivatives by logarithms of what is above 0, and by the others in their units.
 
-    def __init__(
-        self,
-        records: Sequence[CalibrationRecord],
-        modes: int,
-        *,
-        free_gain: bool,
-        free_tip: bool,
-    ) -> None:
+    Without a known load the mode shapes at the tip are not free, without a loop-back the gain is not.
+    """
+
+    def __init__(self, records: Sequence[CalibrationRecord], modes: int) -> None:
         self.records, self.modes = tuple(records), modes
+        self.known = [r for r in self.records if r.load in (Load.MASS, Load.SPRING)]
+        self.has_loopback = any(r.load is Load.LOOPBACK for r in self.records)
         count = 4 * modes + 4
         self.free = np.ones(count, bool)
-        self.free[3 * modes : 4 * modes] = free_tip
-        self.free[4 * modes + 2] = free_gain
+        self.free[3 * modes : 4 * modes] = bool(self.known)
+        self.free[4 * modes + 2] = self.has_loopback
         self._log = np.zeros(count, bool)
         self._log[: 3 * modes] = self._log[4 * modes + 1] = self._log[4 * modes + 2] = True
-        self.known = [r for r in self.records if r.load in (Load.MASS, Load.SPRING)]
         self._known_stds = np.array([max(r.value_std / r.value, 1e-9) for r in self.known])
         self._s = [record.s_rad_s for record in self.records]
         self._root = [np.sqrt(record.variance / 2) for record in self.records]
@@ -301,7 +297,7 @@ def derivatives(
 
 
 def _fitted(
-    problem: _Records, solved: _Solved, excess: FloatArray, contradiction: str, has_loopback: bool
+    problem: _Records, solved: _Solved, excess: FloatArray, contradiction: str
 ) -> Fitted:
     n = problem.modes
     residuals, notes = [], []
@@ -318,7 +314,7 @@ def _fitted(
     limit = UNDETERMINED * size
     limit[4 * n], limit[4 * n + 3] = FEEDTHROUGH_STD, DELAY_STD_S
     determined = problem.free & (np.sqrt(np.diag(solved.covariance)) < limit)
-    if not has_loopback:
+    if not problem.has_loopback:
         notes.append("gain of the channels taken as 1, and their delay not measured: no loop-back")
     if contradiction:
         notes.append(contradiction)
