@@ -270,13 +270,11 @@ def _run(options: argparse.Namespace) -> int:
     if options.plot:
         # drawing libraries take half a second to load: only who wants a figure waits for it
         from tactile_resonance.report.drawing import figure_bytes
-        from tactile_resonance.report.frf_figures import draw_analysis
+        from tactile_resonance.report.figures import draw_analysis, draw_distortion
 
         figure = draw_analysis(analysis, options.record.name)
         outputs[options.plot] = figure_bytes(figure, options.plot.suffix)
         if analysis.distortion is not None:
-            from tactile_resonance.report.frf_figures import draw_distortion
-
             figure = draw_distortion({options.record.name: analysis.distortion}, "Distortion")
             path = options.plot.with_stem(f"{options.plot.stem}_distortion")
             outputs[path] = figure_bytes(figure, path.suffix)

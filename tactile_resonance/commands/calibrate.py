@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
     if options.plot is not None:
         # drawing libraries take half a second to load
         from tactile_resonance.report.drawing import SIMULATED, save_figure
-        from tactile_resonance.report.frf_figures import draw_calibration
+        from tactile_resonance.report.figures import draw_calibration
 
         title = f"calibration of {about['sensor']}" + (
             f" ({SIMULATED})" if truth is not None else ""

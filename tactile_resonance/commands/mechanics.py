@@ -87,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
         write_whole(options.json, (text + "\n").encode())
     if options.plot is not None:
         from tactile_resonance.report.drawing import save_figure
-        from tactile_resonance.report.tissue_figures import draw_tests
+        from tactile_resonance.report.figures import draw_tests
 
         save_figure(draw_tests(tests, "Mechanical tests"), options.plot)
     return 0 if any(one.fit is not None for one in tests) else 1
