@@ -162,7 +162,7 @@ def _build(options: argparse.Namespace) -> int:
     from tactile_resonance.tissue.trial import leave_out, reliability
 
     _check_level(options.unknown_level)
-    runs = read_runs(options.runs)
+    runs = _read_runs(options.runs)
     nominal = read_nominal(options.nominal) if options.nominal else nominal_of(runs)
     points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
     spreads = spreads_of(points, options.pool)
@@ -176,7 +176,7 @@ def _build(options: argparse.Namespace) -> int:
             if s.undetermined
         ),
     ]
-    print_left_out(left_out)
+    _print_left_out(left_out)
     for spread in spreads:
         print("\n".join(_spread_lines(spread)))
     write_whole(options.output, library_text(spreads, nominal, comment).encode())
@@ -218,14 +218,14 @@ def _check(options: argparse.Namespace) -> int:
     from tactile_resonance.tissue.trial import call_points, reliability
 
     _check_level(options.unknown_level)
-    runs = read_runs(options.runs)
+    runs = _read_runs(options.runs)
     classes, nominal = read_classes(options.library)
     if options.nominal:
         nominal = read_nominal(options.nominal)
     points, left_out = reference_points(runs, _labels(options.labels, runs), nominal)
     trial = call_points(points, classes, options.unknown_level)
     bins = reliability(trial)
-    print_left_out(left_out)
+    _print_left_out(left_out)
     _print_trial(trial, bins, options.unknown_level)
     if options.figure:
         figure = new_figure(6, 5)
@@ -240,10 +240,10 @@ def _variance(options: argparse.Namespace) -> int:
     from tactile_resonance.scan.labels import labelled_frfs
     from tactile_resonance.scan.reidentify import scene_band
 
-    runs = read_runs(options.runs)
+    runs = _read_runs(options.runs)
     band_hz = scene_band(options.runs[0]).ends_hz
     g, lines_hz, groups, left_out = labelled_frfs(runs, _labels(options.labels, runs))
-    print_left_out(left_out)
+    _print_left_out(left_out)
     found = print_variance(g, lines_hz, groups, band_hz)
     if options.figure:
         title = "Variance of the FRF by source" + (f", {SIMULATED}" if _simulated(runs) else "")
@@ -286,7 +286,7 @@ def _compare(options: argparse.Namespace) -> int:
 
     good = all(0 <= each < np.inf for each in options.spread or ())
     require(good, "--spread", options.spread, "two finite numbers, 0 or above")
-    runs = read_runs(options.runs)
+    runs = _read_runs(options.runs)
     names = run_names(runs)
     if options.nominal:
         nominal: NominalContact | None = read_nominal(options.nominal)
@@ -313,7 +313,7 @@ def _compare(options: argparse.Namespace) -> int:
     found = differences_from_rest(x, noise, spread, options.rate)
     groups = find_clusters(x, noise, spread if spread.any() else None, options.most)
     pairs = pairs_that_differ(x, noise, spread, options.rate) if len(x) <= MOST_PAIRED else None
-    print_left_out(left_out)
+    _print_left_out(left_out)
     if nominal is None:
         print("warning: no nominal_contact: points that were pressed otherwise differ for that")
     std = np.sqrt(np.diag(spread))
@@ -355,7 +355,7 @@ def _check_level(level: float) -> None:
     require(0 < level < 1, "--unknown-level", level, "a number above 0, below 1")
 
 
-def read_runs(paths: Sequence[Path]) -> list[RunContent]:
+def _read_runs(paths: Sequence[Path]) -> list[RunContent]:
     """Runs, of which what is damaged is printed."""
     from tactile_resonance.front import read_run
 
@@ -393,7 +393,7 @@ def _labels(given: str, runs: Sequence[RunContent]) -> LabelOf:
     return of
 
 
-def print_left_out(reasons: Counter[str]) -> None:
+def _print_left_out(reasons: Counter[str]) -> None:
     """How many points, and why."""
     for reason, count in reasons.most_common():
         print(f"left out: {counted(count, 'point')}, {reason}")

@@ -197,7 +197,8 @@ def means_of(test: IndentationRecord) -> Means:
     edges = [first, *_even(time, first, ramp, RAMP_PARTS)]
     edges += _growing(time, ramp, last + 1, (time[ramp] - time[first]) / RAMP_PARTS)
     turn = len(edges) - 2
-    clear = _clear_from(depth, last)
+    off = np.flatnonzero(depth[last:] < -CLEAR_M)
+    clear = last + int(off[0]) if off.size else depth.size
     if test.protocol is Protocol.INDENTATION:
         edges += _even(time, last + 1, clear, RAMP_PARTS)
     taken = np.asarray(edges)
@@ -273,9 +274,3 @@ def _growing(time: FloatArray, begin: int, end: int, shortest_s: float) -> list[
     parts = np.log1p(since * (GROWTH - 1) / shortest_s) / np.log(GROWTH)
     found = np.flatnonzero(np.diff(np.floor(parts)) > 0) + begin + 1
     return [*(int(i) for i in found), end]
-
-
-def _clear_from(depth: FloatArray, last: int) -> int:
-    """First sample after the hold at which the tip is clear of the tissue; their number where it never is."""
-    clear = np.flatnonzero(depth[last:] < -CLEAR_M)
-    return last + int(clear[0]) if clear.size else depth.size

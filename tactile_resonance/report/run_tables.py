@@ -134,41 +134,42 @@ def truth_columns(truths: Truths) -> Columns:
 
 def bands_table(results: Sequence[PointResult]) -> str:
     """Table of the poles in the second and further bands; an empty text where a run has one band only."""
-    names, rows = ("point", "band [Hz]", "f0 [Hz]", "damping ratio", "status"), []
-    for result in results:
-        for band in result.further:
-            texts = (
-                f"{result.index + 1}",
-                f"{band.band_low_hz:g} to {band.band_high_hz:g}",
-                _with_std(band.f0_hz, band.f0_std_hz, 3),
-                _with_std(band.damping_ratio, band.damping_ratio_std, 5),
-                band.poles_status,
-            )
-            rows.append(texts)
+    names = ("point", "band [Hz]", "f0 [Hz]", "damping ratio", "status")
+    rows = [
+        (
+            f"{result.index + 1}",
+            f"{band.band_low_hz:g} to {band.band_high_hz:g}",
+            _with_std(band.f0_hz, band.f0_std_hz, 3),
+            _with_std(band.damping_ratio, band.damping_ratio_std, 5),
+            band.poles_status,
+        )
+        for result in results
+        for band in result.further
+    ]
     return text_table(names, rows)
 
 
 def distortion_table(results: Sequence[PointResult]) -> str:
     """Levels at the lines left out, against those excited; in brackets the noise; empty where unknown."""
     sides = ("output, even [dB]", "output, odd [dB]", "input, even [dB]", "input, odd [dB]")
-    names, rows = ("point", "band [Hz]", *sides), []
 
     def level(value_db: float, noise_db: float, above: bool) -> str:
         text = f"{_number(value_db, 1)} ({_number(noise_db, 1)})"
         return text if above else f"{text}, only noise"
 
-    for result in results:
-        for band in result.distortion:
-            texts = (
-                f"{result.index + 1}",
-                f"{band.low_hz:g} to {band.high_hz:g}",
-                level(band.even_db, band.even_noise_db, band.even_above_noise),
-                level(band.odd_db, band.odd_noise_db, band.odd_above_noise),
-                _number(band.input_even_db, 1),
-                _number(band.input_odd_db, 1),
-            )
-            rows.append(texts)
-    return text_table(names, rows)
+    rows = [
+        (
+            f"{result.index + 1}",
+            f"{band.low_hz:g} to {band.high_hz:g}",
+            level(band.even_db, band.even_noise_db, band.even_above_noise),
+            level(band.odd_db, band.odd_noise_db, band.odd_above_noise),
+            _number(band.input_even_db, 1),
+            _number(band.input_odd_db, 1),
+        )
+        for result in results
+        for band in result.distortion
+    ]
+    return text_table(("point", "band [Hz]", *sides), rows)
 
 
 def time_table(results: Sequence[PointResult]) -> str:
@@ -196,8 +197,7 @@ def touches_table(surface: Mapping[str, Any] | None) -> str:
     for touch, residual in zip(surface["touches"], surface["residuals_m"], strict=True):
         x, y, z = (f"{1e3 * value:.3f}" for value in touch["ball_m"])
         z += f" ± {1e3 * touch['std_m']:.2g}"
-        texts = (x, y, z, f"{1e3 * residual:+.3f}", f"{1e3 * touch['force_n']:.2f}")
-        rows.append(texts)
+        rows.append((x, y, z, f"{1e3 * residual:+.3f}", f"{1e3 * touch['force_n']:.2f}"))
     told = {
         True: "The touches lie on it as well as their noise allows.",
         False: "The touches lie off it by more than their noise explains.",
