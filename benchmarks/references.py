@@ -21,8 +21,14 @@ from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands
-from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
-from tactile_resonance.report.figures import draw_poles, draw_reliability, draw_steps
+from tactile_resonance.report.drawing import (
+    SIMULATED,
+    draw_poles,
+    draw_reliability,
+    draw_steps,
+    new_figure,
+    save_figure,
+)
 from tactile_resonance.scan.labels import read_nominal
 from tactile_resonance.scan.measurement import excitation_of
 from tactile_resonance.scan.plan import make_plan

@@ -269,8 +269,7 @@ def _run(options: argparse.Namespace) -> int:
         outputs[options.json] = analysis_as_json(analysis).encode()
     if options.plot:
         # drawing libraries take half a second to load: only who wants a figure waits for it
-        from tactile_resonance.report.drawing import figure_bytes
-        from tactile_resonance.report.figures import draw_analysis, draw_distortion
+        from tactile_resonance.report.drawing import draw_analysis, draw_distortion, figure_bytes
 
         figure = draw_analysis(analysis, options.record.name)
         outputs[options.plot] = figure_bytes(figure, options.plot.suffix)

@@ -127,8 +127,12 @@ def _simulation(output: Path) -> None:
 def _distortion(output: Path) -> None:
     from tactile_resonance.frf.distortion import estimate_distortion
     from tactile_resonance.frf.spectra import Spectrum
-    from tactile_resonance.report.drawing import SIMULATED, save_figure
-    from tactile_resonance.report.figures import draw_distortion, draw_distortion_levels
+    from tactile_resonance.report.drawing import (
+        SIMULATED,
+        draw_distortion,
+        draw_distortion_levels,
+        save_figure,
+    )
     from tactile_resonance.simulation.sensor.experiments import records_at_levels
 
     cases = {
@@ -153,8 +157,7 @@ def _distortion(output: Path) -> None:
 def _variance(output: Path) -> None:
     from tactile_resonance.commands.references import print_variance
     from tactile_resonance.frf.spectra import Spectrum
-    from tactile_resonance.report.drawing import SIMULATED, save_figure
-    from tactile_resonance.report.figures import draw_variance
+    from tactile_resonance.report.drawing import SIMULATED, draw_variance, save_figure
     from tactile_resonance.simulation.sensor.experiments import repeated_records
 
     u, y, harmonics, rate_hz = repeated_records(progress=_progress)
@@ -171,8 +174,7 @@ def _variance(output: Path) -> None:
 
 def _mechanics(output: Path) -> None:
     from tactile_resonance.mechanics.indentation import Protocol
-    from tactile_resonance.report.drawing import save_figure
-    from tactile_resonance.report.figures import draw_tests
+    from tactile_resonance.report.drawing import draw_tests, save_figure
     from tactile_resonance.scan.tissue_tests import fitted
     from tactile_resonance.sensor import sensor_named
     from tactile_resonance.simulation.plant.tissue_bench import indent_tissue

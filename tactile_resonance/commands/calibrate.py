@@ -111,8 +111,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"tip mass: {1e6 * mass_kg:.2f} +- {1e6 * mass_std_kg:.2g} mg, of a uniform beam")
     if options.plot is not None:
         # drawing libraries take half a second to load
-        from tactile_resonance.report.drawing import SIMULATED, save_figure
-        from tactile_resonance.report.figures import draw_calibration
+        from tactile_resonance.report.drawing import SIMULATED, draw_calibration, save_figure
 
         title = f"calibration of {about['sensor']}" + (
             f" ({SIMULATED})" if truth is not None else ""

@@ -86,8 +86,7 @@ def run(options: argparse.Namespace) -> int:
         text = json.dumps([one.as_json() for one in tests], indent=1, allow_nan=False)
         write_whole(options.json, (text + "\n").encode())
     if options.plot is not None:
-        from tactile_resonance.report.drawing import save_figure
-        from tactile_resonance.report.figures import draw_tests
+        from tactile_resonance.report.drawing import draw_tests, save_figure
 
         save_figure(draw_tests(tests, "Mechanical tests"), options.plot)
     return 0 if any(one.fit is not None for one in tests) else 1

@@ -154,8 +154,7 @@ def _add_runs(parser: argparse.ArgumentParser) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    from tactile_resonance.report.drawing import save_figure
-    from tactile_resonance.report.figures import draw_references
+    from tactile_resonance.report.drawing import draw_references, save_figure
     from tactile_resonance.scan.labels import nominal_of, read_nominal, reference_points
     from tactile_resonance.tissue.references import library_text
     from tactile_resonance.tissue.spread import smallest_steps, spreads_of
@@ -211,8 +210,7 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from tactile_resonance.report.drawing import new_figure, save_figure
-    from tactile_resonance.report.figures import draw_reliability
+    from tactile_resonance.report.drawing import draw_reliability, new_figure, save_figure
     from tactile_resonance.scan.labels import read_nominal, reference_points
     from tactile_resonance.tissue.references import read_classes
     from tactile_resonance.tissue.trial import call_points, reliability
@@ -235,8 +233,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _variance(options: argparse.Namespace) -> int:
-    from tactile_resonance.report.drawing import SIMULATED, save_figure
-    from tactile_resonance.report.figures import draw_variance
+    from tactile_resonance.report.drawing import SIMULATED, draw_variance, save_figure
     from tactile_resonance.scan.labels import labelled_frfs
     from tactile_resonance.scan.reidentify import scene_band
 
@@ -272,8 +269,7 @@ def print_variance(
 
 def _compare(options: argparse.Namespace) -> int:
     """Compare, group, write both files."""
-    from tactile_resonance.report.drawing import save_figure
-    from tactile_resonance.report.figures import draw_comparison
+    from tactile_resonance.report.drawing import draw_comparison, save_figure
     from tactile_resonance.scan.labels import nominal_of, read_nominal, referred, run_names
     from tactile_resonance.scan.point_result import PointKind
     from tactile_resonance.tissue.comparison import (
