@@ -244,12 +244,11 @@ def run_job(job: Job) -> int:
         with NodeProcesses(work / "log") as nodes:
             nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
             result = _scan(nodes, job, ended)
-    except ScanRefused as error:
-        way_on = "" if job.resume else _way_on(job)  # the same once more would be refused as well
-        raise ValueError(f"{error} (logs in {work / 'log'}){way_on}") from error
     # the nodes have ended: whether a run was begun is certain now
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"{error} (logs in {work / 'log'}){_way_on(job)}") from error
+        # a resumption that was refused would be refused again
+        way_on = "" if job.resume and isinstance(error, ScanRefused) else _way_on(job)
+        raise ValueError(f"{error} (logs in {work / 'log'}){way_on}") from error
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(_way_on(job)) from error
     ended.at_once()  # every file of a report is whole or not there

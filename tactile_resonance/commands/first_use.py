@@ -79,12 +79,12 @@ def _compile(options: argparse.Namespace) -> int:
     from tactile_resonance.mechanics import course
     from tactile_resonance.poles import compiled
 
-    missing = compiled.compiled() + course.compiled() + sum(map(_compiled, STEPPED))
+    missing = compiled.compiled() + course.compiled() + sum(map(_compiled_in, STEPPED))
     print(f"fits: {missing} kernels compiled" if missing else "fits: compiled already")
     return 0
 
 
-def _compiled(name: str) -> int:
+def _compiled_in(name: str) -> int:
     """How many functions of a module were not in the cache and had to be compiled."""
     from numba.core.dispatcher import Dispatcher
 
