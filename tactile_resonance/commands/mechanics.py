@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from tactile_resonance.commands.options import add_figure, add_output
 from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
+from tactile_resonance.front import read_run
 
 if TYPE_CHECKING:
     from tactile_resonance.mechanics.indentation import IndentationRecord
@@ -100,8 +101,6 @@ def _tests(path: Path, options: argparse.Namespace) -> Iterator[TissueTest]:
     if not path.is_dir():
         yield fitted(_read(path, options), most_terms=terms, thickness_m=thickness_m)
         return
-    from tactile_resonance.front import read_run
-
     content = read_run(path)
     tests = list(fits_of(content, most_terms=terms, thickness_m=thickness_m))
     if tests:

@@ -18,6 +18,7 @@ import numpy as np
 from tactile_resonance.commands.options import add_figure, add_file, add_output, add_runs
 from tactile_resonance.fields import counted, require
 from tactile_resonance.files import csv_text, write_whole
+from tactile_resonance.front import read_run
 
 if TYPE_CHECKING:
     from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
@@ -353,8 +354,6 @@ def _check_level(level: float) -> None:
 
 def _read_runs(paths: Sequence[Path]) -> list[RunContent]:
     """Runs, of which what is damaged is printed."""
-    from tactile_resonance.front import read_run
-
     runs = [read_run(path) for path in paths]
     for run in runs:
         for problem in run.problems:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tactile_resonance.commands.options import add_output
 from tactile_resonance.files import write_whole
+from tactile_resonance.front import read_run
 
 COMPARISON = Path("comparison.html")
 
@@ -51,7 +52,6 @@ def run(options: argparse.Namespace) -> int:
 
 def _compare(folders: Sequence[Path], output: Path) -> int:
     # only here: the command answers --help without the library for recordings
-    from tactile_resonance.front import read_run
     from tactile_resonance.report.comparison import as_comparison, differences, sentence, unlike
 
     runs = [read_run(folder) for folder in folders]
@@ -65,10 +65,8 @@ def _compare(folders: Sequence[Path], output: Path) -> int:
 
 def report_run(folder: Path) -> int:
     """Write page, pictures, map and boundary of a run into its folder, and print its table."""
-    # only here: the command answers --help without the library for recordings
-    from tactile_resonance.front import read_run
-
     content = read_run(folder)
+    # only here: the command answers --help without the library for recordings
     from tactile_resonance.report.drawing import figure_bytes
     from tactile_resonance.report.point_details import details_of, truths_of
     from tactile_resonance.report.run_map import (
