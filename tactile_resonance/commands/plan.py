@@ -11,8 +11,6 @@ from tactile_resonance.commands.options import add_figure
 from tactile_resonance.fields import counted, read_yaml
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from tactile_resonance.poles.result import Poles
     from tactile_resonance.scan.decision import Decision
     from tactile_resonance.scan.plan import Plan
@@ -40,7 +38,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read the scene, compile it, print, draw."""
     # only here: the command answers --help without the libraries of scans
-    from tactile_resonance.report.drawing import save_figure
     from tactile_resonance.scan.plan import make_plan
     from tactile_resonance.scan.plan_text import plan_rows
     from tactile_resonance.scan.scene import read_scan_scene
@@ -53,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     for text in _expected(phantoms, plan):
         print(f"{'expected':>12}  {text}")
     if options.figure is not None:
-        save_figure(_draw(plan), options.figure)
+        _draw(plan, options.figure)
         print(f"figure in {options.figure}")
     return 0
 
@@ -130,9 +127,9 @@ def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, Decision]:
     return poles, decision
 
 
-def _draw(plan: Plan) -> Figure:
+def _draw(plan: Plan, path: Path) -> None:
     """Points in their order, seen from above, and the lines that are excited."""
-    from tactile_resonance.report.drawing import new_figure
+    from tactile_resonance.report.drawing import new_figure, save_figure
     from tactile_resonance.scan.measurement import excitation_of
 
     figure = new_figure(13, 5, f"plan of {plan.scene.name}")
@@ -153,4 +150,4 @@ def _draw(plan: Plan) -> Figure:
         lines.axvspan(band.low_hz, band.high_hz, color=f"C{k + 1}", alpha=0.2)
     lines.set(xlabel="frequency [Hz]", ylabel="amplitude of each line [mV]")
     lines.set_title("excited lines; shaded: bands in which poles are identified")
-    return figure
+    save_figure(figure, path)
