@@ -19,10 +19,9 @@ from rclpy.serialization import deserialize_message
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.nodes.excitation_design import NO_RECORDS
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.messages import each_to_message
+from tactile_resonance.nodes.messages import NO_RECORDS, each_to_message
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.recording.messages import GRIDS, each_from_message, time_from_message
