@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import math
 from collections.abc import Callable
 
 from rclpy.action.server import ServerGoalHandle
@@ -13,28 +15,39 @@ from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.admission import require_fit
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
+from tactile_resonance.contact.indentation_record import IndentationRecorder
+from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceInfo, NodeArm
+from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause, ContactResult, not_reached, refusal_cause
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.mechanics.indentation import BallTip
-from tactile_resonance.nodes import contact_devices
-from tactile_resonance.nodes.contact_parameters import ContactSettings, contact_parameters
+from tactile_resonance.fields import check_not_negative
+from tactile_resonance.mechanics.indentation import BallTip, Protocol
+from tactile_resonance.nodes import contact_settings
 from tactile_resonance.nodes.contact_thread import ContactThread
-from tactile_resonance.nodes.contact_topics import ContactTopics
-from tactile_resonance.nodes.force_service import ForceService
+from tactile_resonance.nodes.contact_topics import (
+    ContactTopics,
+    ForceService,
+    StopInput,
+    TouchFromPoles,
+)
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
-from tactile_resonance.nodes.indent_conduct import IndentConduct
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode, end_goal, in_thread
-from tactile_resonance.nodes.messages import contact_feedback, contact_goal, contact_result
+from tactile_resonance.nodes.messages import (
+    RosTime,
+    contact_feedback,
+    contact_goal,
+    contact_result,
+    time_message,
+    touch_of,
+)
 from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import POLES
-from tactile_resonance.nodes.stop_input import StopInput
-from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
+from tactile_resonance.recording.messages import PROTOCOLS, key_of, write_indentation
 
 PARAMETERS = (
-    *contact_devices.PARAMETERS,
+    *contact_settings.PARAMETERS,
     TIME_SERVER,
     Fixed(
         "publish_rate_hz",
@@ -58,12 +71,60 @@ PARAMETERS = (
     Fixed("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball."),
     Fixed("tool_frame", "tool", "Frame of the robot's flange or tool."),
     BROADCAST_TF,
-    *contact_parameters(),
 )
 
 FEEDBACK_EVERY_S = 0.1
 # How long the devices may be dead before the node gives up and is brought up again.
 DEAD_NS = 1_000_000_000
+
+
+class IndentConduct:
+    """A mechanical test under way: its goal for the controller, and a recorder to be given every cycle.
+
+    ``ValueError`` where the request is wrong.
+    """
+
+    def __init__(
+        self,
+        request: Indent.Goal,
+        base_frame: str,
+        ball: BallTip,
+        force: ForceInfo,
+        *,
+        simulated: bool,
+    ) -> None:
+        self._request, self._base_frame = request, base_frame
+        protocol = key_of(PROTOCOLS, request.protocol, "protocol")
+        check_not_negative(request, "hold_s", "press_speed_m_s", "unload_speed_m_s")
+        if protocol is Protocol.INDENTATION and not request.unload_speed_m_s:
+            raise ValueError("unload_speed_m_s: 0, accepted with INDENTATION is a speed above 0")
+        hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
+        self.goal = ContactGoal(
+            touch_of(request, base_frame, ball.radius_m),
+            Aim(request.force_n, hold),
+            press_speed_m_s=request.press_speed_m_s or math.inf,
+            hold_s=request.hold_s,
+            unload_speed_m_s=request.unload_speed_m_s,
+        )
+        self.recorder = IndentationRecorder(
+            self.goal, protocol, ball, force.name, simulated=simulated
+        )
+
+    def result(self, outcome: ContactResult, ros_ns: RosTime) -> Indent.Result:
+        """What became of it; nothing that was recorded is lost where it was not done."""
+        done = outcome.reached and outcome.cause is Cause.HOLD_ENDED
+        cause = Cause.NONE if done else outcome.cause
+        result = Indent.Result(done=done, cause=cause.value, message=outcome.message)
+        record = result.record
+        with contextlib.suppress(ValueError):  # the tissue was not touched
+            write_indentation(record, self.recorder.record(outcome))
+            record.header.stamp = time_message(ros_ns(self.recorder.begun_ns))
+        record.header.frame_id = self._base_frame
+        record.pose, record.hold_s = self._request.pose.pose, self._request.hold_s
+        moved_n, std_m = outcome.zero_change_n, outcome.surface_std_m
+        record.zero_moved_n = math.nan if moved_n is None else moved_n
+        record.depth_std_m = math.nan if std_m is None else std_m
+        return result
 
 
 class ContactNode(ManagedNode):
@@ -81,23 +142,23 @@ class ContactNode(ManagedNode):
         self._arm: NodeArm | None = None
         self._stop = StopInput(self)
         self._stop.draw_back = self._draw_back
-        self._settings = ContactSettings(self, self._take)
+        self._settings = contact_settings.ContactSettings(self, self._take)
 
     def configure(self) -> None:
         """Connect arm and force source."""
         names = ("frame_id", "base_frame", "sensor_frame", "tool_frame")
         frame_id, self._base_frame, sensor_frame, tool_frame = values(self, *names)
         self._topics = ContactTopics(self, self._stop)
-        self._priority = contact_devices.take_realtime(self)
-        self._arm = contact_devices.make_arm(self, self._priority)
+        self._priority = contact_settings.take_realtime(self)
+        self._arm = contact_settings.make_arm(self, self._priority)
         self._settings.read()
         self.resources.callback(self._arm.close)
-        self._tip = contact_devices.tip_geometry(self)
+        self._tip = contact_settings.tip_geometry(self)
         flange = Pose.at_origin().seen_from(self._arm.tip_in_tool)
         broadcast_fixed(self, frame_id, {sensor_frame: self._tip.sensor, tool_frame: flange})
         self._arm.connect()
         # not before: the arm has no clock but the machine's until it is connected
-        self._force = contact_devices.make_force_source(self, self._arm)
+        self._force = contact_settings.make_force_source(self, self._arm)
         self.resources.callback(self._force.close)
         self._force.start()
         self._forces = ForceService(
@@ -185,7 +246,7 @@ class ContactNode(ManagedNode):
 
     def _take(self, parameters: ContactParameters, limits: Limits) -> None:
         if self._arm is not None:
-            contact_devices.require_arm_allows(self._arm.config, parameters, limits)
+            contact_settings.require_arm_allows(self._arm.config, parameters, limits)
         if self._thread is not None:
             self._thread.configure(parameters, limits)
 

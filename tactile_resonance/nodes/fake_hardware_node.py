@@ -14,13 +14,13 @@ from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.clock import ClockLostError
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchServer, PlantChild
+from tactile_resonance.nodes.contact_topics import StopInput
 from tactile_resonance.nodes.ideal_contact import IdealContact
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
 from tactile_resonance.nodes.parameters import Fixed, Parameter, file_of, values
 from tactile_resonance.nodes.running import RESULTS
 from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_message, truth_to_response
-from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE

@@ -20,7 +20,6 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import HOLDS
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.nodes.stop_input import STOP
 from tactile_resonance.recording.messages import PROTOCOLS, time_from_message
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
@@ -85,7 +84,7 @@ class TipContact:
         for each in (client, tester):
             node.resources.callback(each.destroy)
         self._retract = node.client_of(Trigger, "retract")
-        self._stop = node.client_of(SetBool, STOP)
+        self._stop = node.client_of(SetBool, "stop")
 
     def listen(self) -> None:
         """Subscribe to contacts, for one scan; where the tip is now is unknown."""
