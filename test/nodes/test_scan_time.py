@@ -13,7 +13,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from robot_at_hand import own_time
 
 from tactile_resonance.clock import Demand, SimulatedClock
-from tactile_resonance.nodes.bench_player import BenchServer
+from tactile_resonance.nodes.fake_hardware_node import BenchServer
 from tactile_resonance.nodes.node_watch import SILENT_S
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact
