@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
-from collections.abc import Callable
 
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
@@ -255,26 +254,12 @@ class ContactNode(ManagedNode):
         return self._stop.stopped or self._goal is not None or self._fault is not None
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
-        def read() -> tuple[ContactGoal, None]:
-            return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m), None
-
-        outcome, _ = await self._outcome_of(goal, read)
+        outcome, _ = await self._outcome_of(goal)
         end_goal(goal, outcome.reached and not goal.is_cancel_requested)
         return contact_result(outcome)
 
     async def _on_indent(self, goal: ServerGoalHandle) -> Indent.Result:
-        def read() -> tuple[ContactGoal, IndentConduct]:
-            stiffness = self._settings.parameters.beam_n_per_m
-            test = IndentConduct(
-                goal.request,
-                self._base_frame,
-                BallTip(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
-                self._force.info,
-                simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
-            )
-            return test.goal, test
-
-        outcome, test = await self._outcome_of(goal, read)
+        outcome, test = await self._outcome_of(goal)
         result = Indent.Result(cause=outcome.cause.value, message=outcome.message)
         if test is not None:
             result = test.result(outcome, self._arm.clock.ros_ns)
@@ -282,7 +267,7 @@ class ContactNode(ManagedNode):
         return result
 
     async def _outcome_of(
-        self, goal: ServerGoalHandle, read: Callable[[], tuple[ContactGoal, IndentConduct | None]]
+        self, goal: ServerGoalHandle
     ) -> tuple[ContactResult, IndentConduct | None]:
         """What became of a goal, and its test; None: it has none, was not begun, or the node was stopped."""
         try:
@@ -296,7 +281,9 @@ class ContactNode(ManagedNode):
                 abort_force_n=goal.request.abort_force_n or None,
                 depth_m=goal.request.depth_limit_m or None,
             )
-            asked, test = read()
+            test = self._test_of(goal.request) if isinstance(goal.request, Indent.Goal) else None
+            radius_m = self._tip.ball_radius_m
+            asked = contact_goal(goal.request, self._base_frame, radius_m) if test is None else test.goal
             require_fit(self._force.info, asked.aim.force_n)
             self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
@@ -308,6 +295,16 @@ class ContactNode(ManagedNode):
         if outcome is None:
             return not_reached(Cause.STOPPED, "contact_node was stopped"), None
         return outcome, test
+
+    def _test_of(self, request: Indent.Goal) -> IndentConduct:
+        stiffness = self._settings.parameters.beam_n_per_m
+        return IndentConduct(
+            request,
+            self._base_frame,
+            BallTip(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
+            self._force.info,
+            simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
+        )
 
     def _draw_back(self) -> None:
         if self._thread is not None:
