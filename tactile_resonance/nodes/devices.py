@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What excitation_node reads: an acquisition device, the simulated bench as one, and the contact over a block.
-
-And where the records go.
-"""
+"""What excitation_node reads, an acquisition device and the contact over a block, and where the records go."""
 
 from __future__ import annotations
 
