@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
-from collections.abc import Callable
+import math
 
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
@@ -13,28 +14,39 @@ from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.admission import require_fit
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
+from tactile_resonance.contact.indentation_record import IndentationRecorder
+from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceInfo, NodeArm
+from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause, ContactResult, not_reached, refusal_cause
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.mechanics.indentation import BallTip
-from tactile_resonance.nodes import contact_devices
-from tactile_resonance.nodes.contact_parameters import ContactSettings, contact_parameters
+from tactile_resonance.fields import check_not_negative
+from tactile_resonance.mechanics.indentation import BallTip, Protocol
+from tactile_resonance.nodes import contact_settings
 from tactile_resonance.nodes.contact_thread import ContactThread
-from tactile_resonance.nodes.contact_topics import ContactTopics
-from tactile_resonance.nodes.force_service import ForceService
+from tactile_resonance.nodes.contact_topics import (
+    ContactTopics,
+    ForceService,
+    StopInput,
+    TouchFromPoles,
+)
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed
-from tactile_resonance.nodes.indent_conduct import IndentConduct
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode, end_goal, in_thread
-from tactile_resonance.nodes.messages import contact_feedback, contact_goal, contact_result
+from tactile_resonance.nodes.messages import (
+    RosTime,
+    contact_feedback,
+    contact_goal,
+    contact_result,
+    time_message,
+    touch_of,
+)
 from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import POLES
-from tactile_resonance.nodes.stop_input import StopInput
-from tactile_resonance.nodes.touch_from_poles import TouchFromPoles
+from tactile_resonance.recording.messages import PROTOCOLS, key_of, write_indentation
 
 PARAMETERS = (
-    *contact_devices.PARAMETERS,
+    *contact_settings.PARAMETERS,
     TIME_SERVER,
     Fixed(
         "publish_rate_hz",
@@ -58,12 +70,60 @@ PARAMETERS = (
     Fixed("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball."),
     Fixed("tool_frame", "tool", "Frame of the robot's flange or tool."),
     BROADCAST_TF,
-    *contact_parameters(),
 )
 
 FEEDBACK_EVERY_S = 0.1
 # How long the devices may be dead before the node gives up and is brought up again.
 DEAD_NS = 1_000_000_000
+
+
+class IndentConduct:
+    """A mechanical test under way: its goal for the controller, and a recorder to be given every cycle.
+
+    ``ValueError`` where the request is wrong.
+    """
+
+    def __init__(
+        self,
+        request: Indent.Goal,
+        base_frame: str,
+        ball: BallTip,
+        force: ForceInfo,
+        *,
+        simulated: bool,
+    ) -> None:
+        self._request, self._base_frame = request, base_frame
+        protocol = key_of(PROTOCOLS, request.protocol, "protocol")
+        check_not_negative(request, "hold_s", "press_speed_m_s", "unload_speed_m_s")
+        if protocol is Protocol.INDENTATION and not request.unload_speed_m_s:
+            raise ValueError("unload_speed_m_s: 0, accepted with INDENTATION is a speed above 0")
+        hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
+        self.goal = ContactGoal(
+            touch_of(request, base_frame, ball.radius_m),
+            Aim(request.force_n, hold),
+            press_speed_m_s=request.press_speed_m_s or math.inf,
+            hold_s=request.hold_s,
+            unload_speed_m_s=request.unload_speed_m_s,
+        )
+        self.recorder = IndentationRecorder(
+            self.goal, protocol, ball, force.name, simulated=simulated
+        )
+
+    def result(self, outcome: ContactResult, ros_ns: RosTime) -> Indent.Result:
+        """What became of it; nothing that was recorded is lost where it was not done."""
+        done = outcome.reached and outcome.cause is Cause.HOLD_ENDED
+        cause = Cause.NONE if done else outcome.cause
+        result = Indent.Result(done=done, cause=cause.value, message=outcome.message)
+        record = result.record
+        with contextlib.suppress(ValueError):  # the tissue was not touched
+            write_indentation(record, self.recorder.record(outcome))
+            record.header.stamp = time_message(ros_ns(self.recorder.begun_ns))
+        record.header.frame_id = self._base_frame
+        record.pose, record.hold_s = self._request.pose.pose, self._request.hold_s
+        moved_n, std_m = outcome.zero_change_n, outcome.surface_std_m
+        record.zero_moved_n = math.nan if moved_n is None else moved_n
+        record.depth_std_m = math.nan if std_m is None else std_m
+        return result
 
 
 class ContactNode(ManagedNode):
@@ -81,23 +141,23 @@ class ContactNode(ManagedNode):
         self._arm: NodeArm | None = None
         self._stop = StopInput(self)
         self._stop.draw_back = self._draw_back
-        self._settings = ContactSettings(self, self._take)
+        self._settings = contact_settings.ContactSettings(self, self._take)
 
     def configure(self) -> None:
         """Connect arm and force source."""
         names = ("frame_id", "base_frame", "sensor_frame", "tool_frame")
         frame_id, self._base_frame, sensor_frame, tool_frame = values(self, *names)
         self._topics = ContactTopics(self, self._stop)
-        self._priority = contact_devices.take_realtime(self)
-        self._arm = contact_devices.make_arm(self, self._priority)
+        self._priority = contact_settings.take_realtime(self)
+        self._arm = contact_settings.make_arm(self, self._priority)
         self._settings.read()
         self.resources.callback(self._arm.close)
-        self._tip = contact_devices.tip_geometry(self)
+        self._tip = contact_settings.tip_geometry(self)
         flange = Pose.at_origin().seen_from(self._arm.tip_in_tool)
         broadcast_fixed(self, frame_id, {sensor_frame: self._tip.sensor, tool_frame: flange})
         self._arm.connect()
         # not before: the arm has no clock but the machine's until it is connected
-        self._force = contact_devices.make_force_source(self, self._arm)
+        self._force = contact_settings.make_force_source(self, self._arm)
         self.resources.callback(self._force.close)
         self._force.start()
         self._forces = ForceService(
@@ -185,7 +245,7 @@ class ContactNode(ManagedNode):
 
     def _take(self, parameters: ContactParameters, limits: Limits) -> None:
         if self._arm is not None:
-            contact_devices.require_arm_allows(self._arm.config, parameters, limits)
+            contact_settings.require_arm_allows(self._arm.config, parameters, limits)
         if self._thread is not None:
             self._thread.configure(parameters, limits)
 
@@ -194,26 +254,12 @@ class ContactNode(ManagedNode):
         return self._stop.stopped or self._goal is not None or self._fault is not None
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
-        def read() -> tuple[ContactGoal, None]:
-            return contact_goal(goal.request, self._base_frame, self._tip.ball_radius_m), None
-
-        outcome, _ = await self._outcome_of(goal, read)
+        outcome, _ = await self._outcome_of(goal)
         end_goal(goal, outcome.reached and not goal.is_cancel_requested)
         return contact_result(outcome)
 
     async def _on_indent(self, goal: ServerGoalHandle) -> Indent.Result:
-        def read() -> tuple[ContactGoal, IndentConduct]:
-            stiffness = self._settings.parameters.beam_n_per_m
-            test = IndentConduct(
-                goal.request,
-                self._base_frame,
-                BallTip(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
-                self._force.info,
-                simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
-            )
-            return test.goal, test
-
-        outcome, test = await self._outcome_of(goal, read)
+        outcome, test = await self._outcome_of(goal)
         result = Indent.Result(cause=outcome.cause.value, message=outcome.message)
         if test is not None:
             result = test.result(outcome, self._arm.clock.ros_ns)
@@ -221,7 +267,7 @@ class ContactNode(ManagedNode):
         return result
 
     async def _outcome_of(
-        self, goal: ServerGoalHandle, read: Callable[[], tuple[ContactGoal, IndentConduct | None]]
+        self, goal: ServerGoalHandle
     ) -> tuple[ContactResult, IndentConduct | None]:
         """What became of a goal, and its test; None: it has none, was not begun, or the node was stopped."""
         try:
@@ -235,7 +281,9 @@ class ContactNode(ManagedNode):
                 abort_force_n=goal.request.abort_force_n or None,
                 depth_m=goal.request.depth_limit_m or None,
             )
-            asked, test = read()
+            test = self._test_of(goal.request) if isinstance(goal.request, Indent.Goal) else None
+            radius_m = self._tip.ball_radius_m
+            asked = contact_goal(goal.request, self._base_frame, radius_m) if test is None else test.goal
             require_fit(self._force.info, asked.aim.force_n)
             self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
@@ -247,6 +295,16 @@ class ContactNode(ManagedNode):
         if outcome is None:
             return not_reached(Cause.STOPPED, "contact_node was stopped"), None
         return outcome, test
+
+    def _test_of(self, request: Indent.Goal) -> IndentConduct:
+        stiffness = self._settings.parameters.beam_n_per_m
+        return IndentConduct(
+            request,
+            self._base_frame,
+            BallTip(self._tip.ball_radius_m, stiffness_n_per_m=stiffness),
+            self._force.info,
+            simulated=bool(self.time_server or getattr(self._arm.config, "simulated", False)),
+        )
 
     def _draw_back(self) -> None:
         if self._thread is not None:

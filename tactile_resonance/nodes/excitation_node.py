@@ -6,28 +6,83 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
+from tactile_resonance.crest_factor import compress_crest_factor
 from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.fields import counted
-from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes import contact_source, devices, excitation_design
+from tactile_resonance.multisine import Excitation, Grid, design_multisine
+from tactile_resonance.nodes import devices
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread
-from tactile_resonance.nodes.messages import excitation_to_message, record_to_message
+from tactile_resonance.nodes.messages import NO_RECORDS, excitation_to_message, record_to_message
 from tactile_resonance.nodes.parameters import Fixed, Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS
+from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.record import Origin, Record
+from tactile_resonance.recording.messages import GRIDS, each_from_message, key_of
 from tactile_resonance.recording.store import RecordStore
+from tactile_resonance.sensor import MAX_LEVEL_V
+
+ASKED = ("sample_rate_hz", "samples_per_period", "level_v", "periods", "realisations")
+"""Parameters that a goal may state too, by the names that `design_multisine` has for them."""
+MOST_REALISATIONS = 1000  # each is designed, with all its lines, before the first is played
 
 PARAMETERS = (
-    *excitation_design.PARAMETERS,
+    Parameter("sample_rate_hz", 50e3, "Sample rate of both channels [Hz].", 1.0, 1e7),
+    Parameter("samples_per_period", 20000, "Samples of one period.", 4, 10**8),
+    Parameter("f_min_hz", 10.0, "Lowest excited line [Hz].", 1e-3, 1e7),
+    Parameter("f_max_hz", 10e3, "Highest excited line [Hz].", 1e-3, 1e7),
+    Parameter("level_v", 1.0, "Root mean square of the drive [V].", 1e-6, 1e3),
+    Fixed(
+        "max_level_v",
+        MAX_LEVEL_V,
+        "The sensor's limit: a level above is refused [V rms].",
+        1e-6,
+        1e3,
+    ),
+    Parameter(
+        "grid",
+        "full",
+        "Which harmonics are excited.",
+        choices=tuple(grid.value for grid in GRIDS if grid is not Grid.CUSTOM),
+    ),
+    Parameter(
+        "mains_hz",
+        0.0,
+        "Lines at the harmonics of this mains frequency are not excited; 0 excites all [Hz].",
+        0.0,
+        1e3,
+    ),
+    Parameter(
+        "mains_lines_beside", 1, "So many lines on either side of them are not excited too.", 0, 100
+    ),
+    Parameter("periods", 8, "Periods of each realisation.", 1, 10**6),
+    Parameter(
+        "realisations", 1, "Realisations of the phases in each measurement.", 1, MOST_REALISATIONS
+    ),
+    Parameter(
+        "seed",
+        1,
+        "Seed of the phases of the first measurement; each further one takes the next.",
+        1,
+        2**62,
+    ),
+    Parameter(
+        "compression_passes",
+        0,
+        "Passes that make the peaks small; 0 leaves the phases random. For linear work only.",
+        0,
+        10**5,
+    ),
     *devices.PARAMETERS,
-    contact_source.PARAMETER,
     TIME_SERVER,
     HUNG_AFTER,
     Fixed(
@@ -38,7 +93,6 @@ PARAMETERS = (
     ),
     Parameter("block_timeout_s", 10.0, "Longest wait for a block [s].", 0.1, 3600.0),
 )
-
 
 # A device that is read shows life within this beyond the length of a block.
 HUNG_S = 2.0
@@ -79,7 +133,7 @@ class ExcitationNode(ManagedNode):
             self.listen(msg.PointResult, "point_result", self._on_result, POINT_RESULTS)
         self._store: RecordStore | None = None
         self._has_store = False
-        self._contact = contact_source.make_contact_source(self)
+        self._contact = devices.make_contact_source(self)
         self._cancelled = threading.Event()
         self._measured: ServerGoalHandle | None = None
         self._measurements = 0
@@ -129,7 +183,7 @@ class ExcitationNode(ManagedNode):
             excitations = self._plan(goal.request)
             result.measurement_id = excitations[0].measurement_id
             info = self._ready_device(excitations[0].sample_rate_hz)
-            excitation_design.check_output(excitations, info)
+            check_output(excitations, info)
             store = self._open_store()
             if store is not None:
                 store.begin(excitations)
@@ -144,7 +198,8 @@ class ExcitationNode(ManagedNode):
         except (ValueError, OSError, DeviceError) as error:
             if isinstance(error, NotReady):
                 result.outcome = Measure.Result.NOT_READY
-            result.message = _reason(error)
+            # devices raise DeviceError: what the operating system refused has to do with the records
+            result.message = f"{NO_RECORDS if isinstance(error, OSError) else ''}{error}"
             failed = result.outcome == Measure.Result.FAILED
             self.health.error(f"{'failed' if failed else 'refused'}: {result.message}")
         return result
@@ -157,7 +212,7 @@ class ExcitationNode(ManagedNode):
 
     def _plan(self, goal: Measure.Goal) -> list[Excitation]:
         """What the device will play, with ids where neither goal nor device gives any."""
-        asked = excitation_design.design(self, goal, self._measurements)
+        asked = design(self, goal, self._measurements)
         self._measurements += 1
         planned = self._device.plan(asked)
         measurement_id = planned[0].measurement_id or self._new_id()
@@ -266,9 +321,78 @@ class ExcitationNode(ManagedNode):
         )
 
 
-def _reason(error: Exception) -> str:
-    # devices raise DeviceError: what the operating system refused has to do with the records
-    return f"{excitation_design.NO_RECORDS}{error}" if isinstance(error, OSError) else str(error)
+def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation]:
+    """All realisations of a goal; zero in the goal means the node's parameter.
+
+    The measurement id is the goal's, so 0 where it names none; excitation ids are 0.
+
+    Parameters
+    ----------
+    node : Node
+        Has declared `PARAMETERS`.
+    goal : Measure.Goal
+    measurements : int
+        How many came before: the seed moves on.
+
+    Raises
+    ------
+    ValueError
+        Names the field, its value, and what is accepted.
+    """
+    given = {each.name: node.get_parameter(each.name).value for each in PARAMETERS}
+    asked = {name: getattr(goal, name) or given[name] for name in ASKED}
+    if goal.silent and goal.level_v:
+        raise ValueError(f"level_v: {goal.level_v:g}, a silent measurement plays nothing: 0")
+    counts = len(goal.excited_low_hz), len(goal.excited_high_hz)
+    if counts[0] != counts[1]:
+        raise ValueError(
+            f"excited_low_hz, excited_high_hz: {counts} values, as many of each are accepted"
+        )
+    stretches_hz = list(zip(goal.excited_low_hz, goal.excited_high_hz, strict=True))
+    if stretches_hz and (goal.f_min_hz or goal.f_max_hz):
+        raise ValueError(
+            f"f_min_hz, f_max_hz: {goal.f_min_hz:g}, {goal.f_max_hz:g}, 0 are accepted beside excited_low_hz"
+        )
+    level, max_level = asked["level_v"], given["max_level_v"]
+    if not level <= max_level:
+        raise ValueError(f"level_v: {level:g}, the sensor bears at most {max_level:g} V rms")
+    grid = key_of(GRIDS, goal.grid, "grid") if goal.grid else Grid(given["grid"])
+    realisations = asked["realisations"]
+    if realisations > MOST_REALISATIONS:
+        raise ValueError(f"realisations: {realisations}, accepted is up to {MOST_REALISATIONS}")
+    ends_hz = goal.f_min_hz or given["f_min_hz"], goal.f_max_hz or given["f_max_hz"]
+    excitations = [
+        design_multisine(
+            **asked,
+            band_hz=stretches_hz or ends_hz,
+            grid=grid,
+            mains_hz=(given["mains_hz"],) if given["mains_hz"] else (),
+            lines_beside=given["mains_lines_beside"],
+            sweep=goal.sweep,
+            seed=goal.seed or given["seed"] + measurements,
+            realisation=realisation,
+            measurement_id=goal.measurement_id,
+            label=goal.label,
+            bands=each_from_message(PoleBand, goal.bands),
+        )
+        for realisation in range(realisations)
+    ]
+    if goal.silent:
+        return [replace(each, amplitude_v=np.zeros(each.harmonics.size)) for each in excitations]
+    if (passes := given["compression_passes"]) and not goal.sweep:
+        return [compress_crest_factor(each, passes=passes) for each in excitations]
+    return excitations
+
+
+def check_output(excitations: Sequence[Excitation], info: DeviceInfo) -> None:
+    """ValueError if a peak is more than the device can put out."""
+    for excitation in excitations:
+        peak_v = float(np.max(np.abs(excitation.period())))
+        if peak_v > info.output_peak_v:
+            raise ValueError(
+                f"level_v: peak {peak_v:.3g} V, {info.name} puts out at most "
+                f"{info.output_peak_v:.3g} V"
+            )
 
 
 def main() -> None:

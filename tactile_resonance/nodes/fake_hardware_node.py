@@ -3,31 +3,41 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from rosgraph_msgs.msg import Clock
 
 from tactile_resonance import msg
 from tactile_resonance.clock import PORT as TIME_PORT
-from tactile_resonance.clock import ClockLostError
+from tactile_resonance.clock import ClockLostError, SimulatedClock, time_address
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.bench_player import BenchNow, BenchPlayer, BenchServer, PlantChild
+from tactile_resonance.nodes.contact_topics import StopInput
 from tactile_resonance.nodes.ideal_contact import IdealContact
 from tactile_resonance.nodes.managed_node import TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import record_to_message, time_message
 from tactile_resonance.nodes.parameters import Fixed, Parameter, file_of, values
 from tactile_resonance.nodes.running import RESULTS
-from tactile_resonance.nodes.simulated_tip import SimulatedTip, truth_message, truth_to_response
-from tactile_resonance.nodes.stop_input import StopInput
+from tactile_resonance.nodes.simulated_tip import (
+    PlantChild,
+    SimulatedTip,
+    truth_message,
+    truth_to_response,
+)
 from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import excitation_from_message
+from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
 from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactSoFar
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
+from tactile_resonance.simulation.ur5e.reactor import Reactor
 from tactile_resonance.srv import Play, Truth
 
 PARAMETERS = (
@@ -62,9 +72,147 @@ PARAMETERS = (
     Fixed("base_frame", "base", "Frame of the robot's base, of all poses."),
 )
 
-
 EFFECTS = ("noise", "quantisation", "nonlinearity")
 HERTZ = {"contact_radius_m": math.nan, "depth_m": math.nan}  # of a tip: not that of the plant
+STEP_NS = 2_000_000
+CLOCK_S = 0.04
+"""Between two messages on `/clock`, by the machine's clock."""
+
+
+class BenchServer:
+    """Serves the time of a bench without a robot, in a thread of its own.
+
+    Parameters
+    ----------
+    address : str
+        ``HOST:PORT``.
+
+    Raises
+    ------
+    ValueError
+        If the port cannot be opened.
+    """
+
+    def __init__(self, address: str) -> None:
+        host, port = time_address(address)
+        self._reactor = Reactor(host)
+        self._time = BenchTime(self._reactor, STEP_NS, simulated=True)
+        try:
+            self._reactor.listen(port, self._time.serve)
+        except ValueError:
+            self._reactor.close()
+            raise
+        self._thread = threading.Thread(target=self._time.run, name="bench time", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the time, for all participants."""
+        self._time.stop()
+        self._thread.join()
+        self._reactor.close()
+
+
+class BenchNow:
+    """ROS time as the bench has it; for any thread.
+
+    Parameters
+    ----------
+    node : ManagedNode
+        Publishes simulated time on `/clock` until it is cleaned up, where it lives in that.
+    """
+
+    def __init__(self, node: ManagedNode) -> None:
+        self._clock: SimulatedClock | None = None
+        self._lock = threading.Lock()
+        if node.time_server:
+            self._clock = SimulatedClock(node.time_server, node.get_name())
+            node.resources.callback(self._clock.close)
+            self._publisher = node.publish_on(Clock, "/clock", 1)
+            node.every(CLOCK_S, self._publish)
+
+    def __call__(self) -> int:
+        """Time now [ns]."""
+        if self._clock is None:
+            return time.time_ns()
+        with self._lock:
+            return self._clock.ask_ns()
+
+    def _publish(self) -> None:
+        with contextlib.suppress(ClockLostError):  # the bench has ended, which its owner reports
+            self._publisher.publish(Clock(clock=time_message(self())))
+
+
+class BenchPlayer:
+    """Plays one excitation at a time, in a thread of its own.
+
+    Parameters
+    ----------
+    time_server : str
+        Address of the simulated time in which it plays; empty: the machine's clock.
+    """
+
+    def __init__(self, time_server: str) -> None:
+        self._time_server = time_server
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._clock: SimulatedClock | None = None
+
+    def play(
+        self,
+        excitation: Excitation,
+        start_ns: int,
+        hand_out: Callable[[int], None],
+    ) -> None:
+        """Begin to play; what was played before must have been silenced.
+
+        Parameters
+        ----------
+        excitation : Excitation
+        start_ns : int
+            ROS time of the first sample [ns].
+        hand_out : callable
+            Called in the thread with the ROS time of the end of each block [ns], at that time.
+
+        Raises
+        ------
+        ClockLostError
+            If no bench serves the simulated time.
+        """
+        if self._time_server:
+            self._clock = SimulatedClock(self._time_server, "bench")
+        self._stop.clear()
+
+        def play() -> None:
+            for count in range(1, excitation.periods + 1):
+                end_ns = start_ns + round(count * excitation.period_s * 1e9)
+                if not self._wait_until(end_ns):
+                    return
+                hand_out(end_ns)
+
+        self._thread = threading.Thread(target=play, name="bench", daemon=True)
+        self._thread.start()
+
+    def silence(self) -> None:
+        """Stop at once; returns when nothing more is handed out."""
+        self._stop.set()
+        if self._clock is not None:
+            self._clock.interrupt()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._clock is not None:
+            self._clock.close()
+            self._clock = None
+
+    def _wait_until(self, time_ns: int) -> bool:
+        """Wait for a ROS time [ns]; False where it was silenced meanwhile."""
+        if self._clock is None:
+            return not self._stop.wait(max(0, time_ns - time.time_ns()) / 1e9)
+        try:
+            self._clock.sleep_until(time_ns)
+        except ClockLostError:
+            return False
+        return not self._stop.is_set()
 
 
 class FakeHardwareNode(ManagedNode):

@@ -26,6 +26,7 @@ from tactile_resonance.contact.result import (
     not_reached,
     refusal_cause,
 )
+from tactile_resonance.nodes.contact_topics import StopInput
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.nodes.messages import (
     contact_result,
@@ -36,7 +37,6 @@ from tactile_resonance.nodes.messages import (
 from tactile_resonance.nodes.parameters import values
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.nodes.simulated_tip import SimulatedTip, Stay, pressing
-from tactile_resonance.nodes.stop_input import StopInput
 from tactile_resonance.record import Contact
 
 CONTACT_S = 0.5

@@ -72,6 +72,9 @@ CONTACT_FIGURES = (
     *("contact_s", "total_s", "peak_force_n"),
 )
 
+NO_RECORDS = "record_folder: "
+"""The message of a measurement that failed because records cannot be written begins so."""
+
 M = TypeVar("M")
 RosTime = Callable[[int], int]
 """From a time of the loop's clock [ns] to ROS time [ns]."""

@@ -19,6 +19,7 @@ from rclpy.node import Node
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.fields import numbers
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,4 @@ def file_of(name: str) -> Path:
 
 def pose_of(values: list[float], name: str) -> Pose:
     """Pose of a parameter of six numbers."""
-    vector = np.array(values, dtype=float)
-    if vector.shape != (6,) or not np.all(np.isfinite(vector)):
-        raise ValueError(f"{name}: {list(values)}, expected 6 numbers")
-    return Pose.from_vector(vector)
+    return Pose.from_vector(np.array(numbers(list(values), name, 6)))

@@ -1,32 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Actions `scan` and `calibrate_table`: goals, feedback and results as messages, and the work of the latter."""
+"""Actions `scan` and `calibrate_table`: one goal at a time; goals, feedback and results as messages."""
 
 from __future__ import annotations
 
 import math
-import os
-import time
-from pathlib import Path
-from typing import BinaryIO
+from collections.abc import Awaitable, Callable
+from contextlib import AbstractContextManager
+from typing import Any
 
 from rclpy.action.server import ServerGoalHandle
+from std_srvs.srv import Trigger
 
 from tactile_resonance.action import CalibrateTable, Scan
-from tactile_resonance.nodes.scan_hands import NodeHands
+from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.poles.result import Poles
-from tactile_resonance.scan.goal import Frames, ScanGoal
-from tactile_resonance.scan.hands import Check, Interrupted, PointFailed, ScanEnded, Touch
-from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.progress import Progress, Summary
+from tactile_resonance.scan.goal import ScanGoal
+from tactile_resonance.scan.progress import Controls, Progress, Request, Summary
 from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.table_calibration import (
     NOT_ESTIMATED,
     CalibrationRequest,
     TableCalibration,
-    as_text,
-    calibrate_table,
 )
-from tactile_resonance.sensor import sensor_named
+
+RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 
 # Fields of equal name in message and object.
 SCAN_OPTIONS = (
@@ -38,6 +35,124 @@ CALIBRATION_OPTIONS = (
     *("force_n", "search_m", "flatness_m", "most_tilt_rad"),
     *("heading_rad", "sensor", "file"),
 )
+
+
+class OneGoal:
+    """Several actions of one node, of which one goal at a time is worked at, in a thread of its own.
+
+    Accepts, works at and ends goals; reports why the newest one was rejected.
+
+    Parameters
+    ----------
+    node : ManagedNode
+        Whose actions they are, until it is cleaned up, and whose service ``scan/rejection`` has the reason:
+        rclpy has no place for it in its answer to a goal.
+    around : callable
+        Context of the work, entered and left in the executor's thread.
+
+    Attributes
+    ----------
+    handle : ServerGoalHandle or None
+        The goal that is worked at.
+    controls : Controls or None
+        What is asked of it; None where none is worked at.
+    """
+
+    def __init__(
+        self, node: ManagedNode, around: Callable[[], AbstractContextManager[None]]
+    ) -> None:
+        self._node, self._around = node, around
+        self.handle: ServerGoalHandle | None = None
+        self.controls: Controls | None = None
+        self._asked = self._rejection = ""
+        node.serve(Trigger, "scan/rejection", self._on_rejection)
+
+    def act(
+        self,
+        kind: type,
+        name: str,
+        check: Callable[[Any], Awaitable[Any]],
+        work: Callable[[ServerGoalHandle, Any], Any],
+        done: int,
+        busy: Any,
+    ) -> None:
+        """Offer an action.
+
+        Parameters
+        ----------
+        kind : type
+        name : str
+        check : callable
+            Awaited with the goal; raises ``ValueError`` or ``OSError`` where it is wrong.
+        work : callable
+            Called in a thread with the handle of the goal and what its check has returned; returns the result.
+        done : int
+            The result's field ``outcome`` of a goal that has succeeded.
+        busy : message
+            Result of a goal that was accepted beside another one.
+        """
+        found: dict[int, Any] = {}  # by the check of a goal, by its message
+
+        async def refuses(message: Any) -> bool:
+            self._asked = asked = str(message)
+            reason = ""
+            try:
+                self._require_free()
+                checked = await check(message)
+                self._require_free()
+                found[id(message)] = checked
+            except (ValueError, OSError) as error:
+                reason = " ".join(str(error).split())
+                self._node.get_logger().warning(f"goal rejected: {reason}")
+            if self._asked == asked:  # no other came while this one was checked
+                self._rejection = reason
+            return bool(reason)
+
+        async def serve(goal: ServerGoalHandle) -> Any:
+            checked = found.pop(id(goal.request))
+            if self.handle is not None:
+                goal.abort()
+                return busy
+            self.handle, self.controls = goal, Controls()
+            if goal.is_cancel_requested or not self._node.active:  # before there were controls
+                self.cancel()
+            try:
+                with self._around():
+                    result = await in_thread(self._node, lambda: work(goal, checked), "goal")
+            finally:
+                self.handle = self.controls = None
+            end_goal(goal, result.outcome == done)
+            return result
+
+        self._node.act(kind, name, serve, lambda _: self.cancel(), refuses)
+
+    def serve_control(self, name: str, ask: Callable[[Controls], None]) -> None:
+        """Service that asks something of the goal that is worked at."""
+
+        def do() -> str:
+            if self.controls is None:
+                raise ValueError("no scan is running")
+            ask(self.controls)
+            return ""
+
+        self._node.serve_trigger(name, do)
+
+    def cancel(self) -> None:
+        """Cancel the goal that is worked at."""
+        if self.controls is not None:
+            self.controls.ask(Request.CANCEL)
+
+    def forget_rejection(self) -> None:
+        """From now on nothing was rejected."""
+        self._rejection = ""
+
+    def _require_free(self) -> None:
+        if self.handle is not None:
+            raise ValueError(RUNNING)
+
+    def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = bool(self._rejection), self._rejection
+        return response
 
 
 def scan_goal(message: Scan.Goal) -> ScanGoal:
@@ -111,85 +226,3 @@ def fill_calibration_result(result: CalibrateTable.Result, made: TableCalibratio
     result.residuals_m = made.residuals_m.tolist()
     result.std_m = made.std_m.tolist()
     result.reduced_chi_square = made.reduced_chi_square
-
-
-def calibrate(
-    goal: ServerGoalHandle,
-    request: CalibrationRequest,
-    hands: NodeHands,
-    check: Check,
-    frames: Frames,
-    who: str,
-) -> CalibrateTable.Result:
-    """Touch, fit and save, in a thread of its own.
-
-    Parameters
-    ----------
-    goal : ServerGoalHandle
-    request : CalibrationRequest
-        What it asks for, its file where it may be.
-    hands : NodeHands
-    check : callable
-        Raises `Interrupted` where the goal is cancelled.
-    frames : Frames
-        With the table as it is known.
-    who : str
-        Made it, for the file.
-    """
-    radius_m = sensor_named(request.sensor).tip.radius_m
-    feedback = CalibrateTable.Feedback(points=len(request.points_m), height_m=math.nan)
-
-    def touch(point: ScanPoint) -> Touch:
-        feedback.point = point.index
-        goal.publish_feedback(feedback)
-        found = hands.find(point, request.force_n, radius_m, check)
-        feedback.height_m = found.ball_m[2] - radius_m
-        return found
-
-    result = no_table(CalibrateTable.Result.FAILED)
-    file = None
-    try:
-        file = _new_file(request.file) if request.file else None
-        hands.retract()
-        made = calibrate_table(request, frames.table_in_base, radius_m, touch)
-    except (PointFailed, ScanEnded, Interrupted) as error:
-        result.message = str(error) or "cancelled"
-        return result
-    except ValueError as error:
-        result.outcome, result.message = result.REFUSED, str(error)
-        return result
-    else:
-        fill_calibration_result(result, made)
-        if file is None:
-            return result
-        known = {
-            "base_frame": frames.base,
-            "table_frame": frames.table,
-            "known_table_in_base": frames.table_in_base.vector.tolist(),
-            "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            "made_by": who,
-        }
-        try:
-            file.write(as_text(made, request, known).encode())
-            file.flush()
-            os.fsync(file.fileno())
-            result.file = request.file
-        except OSError as error:
-            result.message += f". NOT WRITTEN: {error}"
-        return result
-    finally:
-        if file is not None:
-            file.close()
-            if not result.file:
-                Path(request.file).unlink()
-
-
-def _new_file(name: str) -> BinaryIO:
-    """Open a new file before anything is touched; ``ValueError`` where there can be none."""
-    path = Path(name)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return path.open("xb")
-    except OSError as error:
-        accepted = f"a new file in a folder that can be written ({error.strerror})"
-        raise ValueError(f"file: got {name!r}; accepted is {accepted}") from error

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot and sensor of a scan, through the actions of contact_node and excitation_node."""
+"""Robot, sensor and time of a scan, through the nodes that have them."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -16,6 +16,7 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.serialization import serialize_message
 
 from tactile_resonance import msg
+from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -24,10 +25,9 @@ from tactile_resonance.nodes.goals import POLL_S, Poll, answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.measure_client import MeasureClient
 from tactile_resonance.nodes.messages import pose_to_message
-from tactile_resonance.nodes.node_watch import Instances, NodeWatch
+from tactile_resonance.nodes.node_watch import SILENT_S, Instances, NodeWatch
 from tactile_resonance.nodes.parameters import values
 from tactile_resonance.nodes.running import PLACES
-from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
 from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import poles_from_message
@@ -67,6 +67,100 @@ TIP_PARAMETERS = ("standoff_m", "early_m")
 TIP_LIMITS = ("depth_m", "near_m", "misalignment_rad", "clearance_m")
 TIP_NAMES = (*TIP_GEOMETRY, *(f"contact.{n}" for n in TIP_PARAMETERS), *(f"limits.{n}" for n in TIP_LIMITS))
 ANSWERED_WITHIN_S = 5.0
+GO_AGAIN_S = 0.2
+
+
+class ScanTime:
+    """The time of a scan: the machine's, or that of a simulated bench, which the scan conducts.
+
+    On the machine's clock only `now_s` does something.
+
+    While a scan conducts, simulated time passes only where something needs it to: a contact on its way, a
+    block that is measured. It stands while nodes compute and while the scan decides.
+
+    Parameters
+    ----------
+    server : str
+        Address of the simulated time; empty: the machine's clock.
+    hung_after_s : float
+        In simulated time a node is given up after so long without a sign of life [s of the machine's clock].
+
+    Attributes
+    ----------
+    simulated : bool
+    silent_s : float
+        After so long without a sign of life a node is given up [s of the machine's clock].
+    """
+
+    def __init__(self, server: str, hung_after_s: float) -> None:
+        self._server = server
+        self.simulated = bool(server)
+        self.silent_s = hung_after_s if server else SILENT_S
+        self._clock: SimulatedClock | None = None
+        self._gone_s = -math.inf
+        self._offset_ns = self._last_ns = 0  # a bench that is restarted begins its time anew
+
+    @contextmanager
+    def conducted(self) -> Iterator[None]:
+        """Conduct; a bench that cannot be reached now is tried again by `go`."""
+        if self.simulated:
+            with self._while_there():
+                self._join()
+        try:
+            yield
+        finally:
+            self._end()
+
+    def _end(self) -> None:
+        """Conduct no more: time goes on at the pace of real time."""
+        if self._clock is not None:
+            self._clock.close()
+            self._clock = None
+
+    def patience_s(self, real_s: float) -> float:
+        """Longest wait for nodes at work: in simulated time for as long as one may be silent [s]."""
+        return self.silent_s if self.simulated else real_s
+
+    def now_s(self) -> float:
+        """Time for durations [s]; never goes back."""
+        if not self.simulated:
+            return time.monotonic()
+        if self._clock is not None:
+            with self._while_there():
+                self._last_ns = self._clock.ask_ns() + self._offset_ns
+        return self._last_ns * 1e-9
+
+    def go(self) -> None:
+        """Let time go on while something needs it, until a device hands a result over."""
+        self._gone_s = time.monotonic()
+        if not self.simulated:
+            return
+        with self._while_there():
+            (self._clock or self._join()).go()
+
+    def keep_going(self) -> None:
+        """`go` again from time to time, where no result is awaited: somebody else's measurement ends a go."""
+        if time.monotonic() - self._gone_s > GO_AGAIN_S:
+            self.go()
+
+    def seed(self, *integers: int) -> None:
+        """Let the noise of the bench follow from integers, three at most, from now on."""
+        if self._clock is not None:
+            with self._while_there():
+                self._clock.seed(*integers)
+
+    def _join(self) -> SimulatedClock:
+        clock = self._clock = SimulatedClock(self._server, "scan_node", conducts=True)
+        self._offset_ns = max(self._offset_ns, self._last_ns - clock.now_ns())
+        return clock
+
+    @contextmanager
+    def _while_there(self) -> Iterator[None]:
+        """Conduct no more where the bench has ended."""
+        try:
+            yield
+        except ClockLostError:
+            self._end()
 
 
 class NodeHands:
@@ -77,7 +171,6 @@ class NodeHands:
     node : ManagedNode
         Where its parameter ``contact`` is none the tip is not moved; it is taken to be where the plan states,
         and its pose is published.
-    scan_time : ScanTime
     tell_waiting : callable
         Called in the scan's thread with the node that keeps the scan waiting, for people; empty: none any more.
 
@@ -91,18 +184,17 @@ class NodeHands:
         Of the scan's surface, to be set before a scan.
     """
 
-    def __init__(
-        self, node: ManagedNode, scan_time: ScanTime, tell_waiting: Callable[[str], None]
-    ) -> None:
-        self._node, self._time, self._tell_waiting = node, scan_time, tell_waiting
+    def __init__(self, node: ManagedNode, tell_waiting: Callable[[str], None]) -> None:
+        self._node, self._tell_waiting = node, tell_waiting
+        self._time = ScanTime(node.time_server, node.hung_after_s)
         self.frame_in_base = Pose.at_origin()
         self.standoffs = Standoffs(Plane())
         contact, self._base_frame = values(node, "contact", "base_frame")
         self.free_air = contact == "robot"
-        self._measure = MeasureClient(node, scan_time)
+        self._measure = MeasureClient(node, self._time)
         self._tip: TipContact | None = None
         if self.free_air:
-            self._tip = TipContact(node, scan_time, self._end_if_hung)
+            self._tip = TipContact(node, self._time, self._end_if_hung)
             self._parameters = node.client_of(GetParameters, "contact_node/get_parameters")
         else:
             self._pose = node.publish_on(PoseStamped, "tcp_pose", PLACES)
@@ -124,12 +216,15 @@ class NodeHands:
         # last: a node whose sign of life arrives has discovered all subscriptions made before
         self._nodes = NodeWatch(self._node, topics, self._time.silent_s)
 
-    def meet(self) -> None:
-        """Wait until the nodes have discovered the subscriptions of this scan."""
-        simulated = self._time.simulated
-        deadline = time.monotonic() + (MET_SIMULATED_WITHIN_S if simulated else MET_WITHIN_S)
-        while not self._nodes.met() and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+    @contextmanager
+    def at_work(self) -> Iterator[None]:
+        """Conduct the time; begins once the nodes have discovered the subscriptions of this scan."""
+        within_s = MET_SIMULATED_WITHIN_S if self._time.simulated else MET_WITHIN_S
+        with self._time.conducted():
+            deadline = time.monotonic() + within_s
+            while not self._nodes.met() and time.monotonic() < deadline:
+                time.sleep(POLL_S)
+            yield
 
     def now_s(self) -> float:
         """Time by which durations count [s]."""

@@ -7,46 +7,41 @@ import math
 import os
 import socket
 import time
-from collections.abc import Awaitable, Callable
-from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import BinaryIO
 
 from rclpy.action.server import ServerGoalHandle
-from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.fields import require
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed, look_up
-from tactile_resonance.nodes.managed_node import (
-    HUNG_AFTER,
-    TIME_SERVER,
-    ManagedNode,
-    end_goal,
-    in_thread,
-)
+from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
 from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_actions import (
-    calibrate,
+    RUNNING,
+    OneGoal,
     calibration_request,
+    fill_calibration_result,
     fill_scan_result,
     no_table,
     scan_feedback,
     scan_goal,
 )
 from tactile_resonance.nodes.scan_hands import NodeHands
-from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.scan.goal import Frames, GoalFiles, named_frames, resumed_run
-from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
+from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.point_result import TOPIC
+from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.preparation import UNCHECKED
-from tactile_resonance.scan.progress import Controls, Phase, Progress, Request
+from tactile_resonance.scan.progress import Phase, Progress, Request
 from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.run_start import new_run, start_run
 from tactile_resonance.scan.runner import ScanRunner
-from tactile_resonance.scan.table_calibration import CalibrationRequest
+from tactile_resonance.scan.table_calibration import CalibrationRequest, as_text, calibrate_table
+from tactile_resonance.sensor import sensor_named
 
 PARAMETERS = (
     Fixed(
@@ -85,7 +80,6 @@ PARAMETERS = (
     HUNG_AFTER,
 )
 
-RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 FEEDBACK_EVERY_S = 0.2
 CONTROLS = {
     "scan/pause": lambda controls: controls.paused.set(),
@@ -93,124 +87,6 @@ CONTROLS = {
     "scan/skip_point": lambda controls: controls.ask(Request.SKIP),
     "scan/repeat_point": lambda controls: controls.ask(Request.REPEAT),
 }
-
-
-class OneGoal:
-    """Several actions of one node, of which one goal at a time is worked at, in a thread of its own.
-
-    Accepts, works at and ends goals; reports why the newest one was rejected.
-
-    Parameters
-    ----------
-    node : ManagedNode
-        Whose actions they are, until it is cleaned up, and whose service ``scan/rejection`` has the reason:
-        rclpy has no place for it in its answer to a goal.
-    around : callable
-        Context of the work, entered and left in the executor's thread.
-
-    Attributes
-    ----------
-    handle : ServerGoalHandle or None
-        The goal that is worked at.
-    controls : Controls or None
-        What is asked of it; None where none is worked at.
-    """
-
-    def __init__(
-        self, node: ManagedNode, around: Callable[[], AbstractContextManager[None]]
-    ) -> None:
-        self._node, self._around = node, around
-        self.handle: ServerGoalHandle | None = None
-        self.controls: Controls | None = None
-        self._asked = self._rejection = ""
-        node.serve(Trigger, "scan/rejection", self._on_rejection)
-
-    def act(
-        self,
-        kind: type,
-        name: str,
-        check: Callable[[Any], Awaitable[Any]],
-        work: Callable[[ServerGoalHandle, Any], Any],
-        done: int,
-        busy: Any,
-    ) -> None:
-        """Offer an action.
-
-        Parameters
-        ----------
-        kind : type
-        name : str
-        check : callable
-            Awaited with the goal; raises ``ValueError`` or ``OSError`` where it is wrong.
-        work : callable
-            Called in a thread with the handle of the goal and what its check has returned; returns the result.
-        done : int
-            The result's field ``outcome`` of a goal that has succeeded.
-        busy : message
-            Result of a goal that was accepted beside another one.
-        """
-        found: dict[int, Any] = {}  # by the check of a goal, by its message
-
-        async def refuses(message: Any) -> bool:
-            self._asked = asked = str(message)
-            reason = ""
-            try:
-                self._require_free()
-                checked = await check(message)
-                self._require_free()
-                found[id(message)] = checked
-            except (ValueError, OSError) as error:
-                reason = " ".join(str(error).split())
-                self._node.get_logger().warning(f"goal rejected: {reason}")
-            if self._asked == asked:  # no other came while this one was checked
-                self._rejection = reason
-            return bool(reason)
-
-        async def serve(goal: ServerGoalHandle) -> Any:
-            checked = found.pop(id(goal.request))
-            if self.handle is not None:
-                goal.abort()
-                return busy
-            self.handle, self.controls = goal, Controls()
-            if goal.is_cancel_requested or not self._node.active:  # before there were controls
-                self.cancel()
-            try:
-                with self._around():
-                    result = await in_thread(self._node, lambda: work(goal, checked), "goal")
-            finally:
-                self.handle = self.controls = None
-            end_goal(goal, result.outcome == done)
-            return result
-
-        self._node.act(kind, name, serve, lambda _: self.cancel(), refuses)
-
-    def serve_control(self, name: str, ask: Callable[[Controls], None]) -> None:
-        """Service that asks something of the goal that is worked at."""
-
-        def do() -> str:
-            if self.controls is None:
-                raise ValueError("no scan is running")
-            ask(self.controls)
-            return ""
-
-        self._node.serve_trigger(name, do)
-
-    def cancel(self) -> None:
-        """Cancel the goal that is worked at."""
-        if self.controls is not None:
-            self.controls.ask(Request.CANCEL)
-
-    def forget_rejection(self) -> None:
-        """From now on nothing was rejected."""
-        self._rejection = ""
-
-    def _require_free(self) -> None:
-        if self.handle is not None:
-            raise ValueError(RUNNING)
-
-    def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = bool(self._rejection), self._rejection
-        return response
 
 
 class ScanNode(ManagedNode):
@@ -228,8 +104,7 @@ class ScanNode(ManagedNode):
         names = ("table_in_base", "table_frame", "base_frame")
         table, table_frame, base_frame = values(self, *names)
         self._frames = Frames(table_frame, base_frame, pose_of(table, "table_in_base"))
-        self._time = ScanTime(self.time_server, self.hung_after_s)
-        self._hands = NodeHands(self, self._time, self._tell_waiting)
+        self._hands = NodeHands(self, self._tell_waiting)
         broadcast_fixed(self, base_frame, {table_frame: self._frames.table_in_base})
         self._files = GoalFiles(*values(self, "run_folder", "goal_folders"))
         self._results = self.publish_on(msg.PointResult, TOPIC, POINT_RESULTS)
@@ -288,13 +163,55 @@ class ScanNode(ManagedNode):
     def _calibrate(
         self, goal: ServerGoalHandle, request: CalibrationRequest
     ) -> CalibrateTable.Result:
+        """Touch, fit and save."""
+        # those of this configuration: the node may have another one before the tip is back
+        hands, frames, check = self._hands, self._frames, self._goals.controls.check_cancelled
         who = f"{self.get_fully_qualified_name()} on {socket.gethostname()}"
         who += ", simulated" if self.time_server else ""
-        check = self._goals.controls.check_cancelled
-        self._hands.frame_in_base = self._frames.table_in_base
-        with self._time.conducted():
-            self._hands.meet()
-            result = calibrate(goal, request, self._hands, check, self._frames, who)
+        hands.frame_in_base = frames.table_in_base
+        radius_m = sensor_named(request.sensor).tip.radius_m
+        feedback = CalibrateTable.Feedback(points=len(request.points_m), height_m=math.nan)
+
+        def touch(point: ScanPoint) -> Touch:
+            feedback.point = point.index
+            goal.publish_feedback(feedback)
+            found = hands.find(point, request.force_n, radius_m, check)
+            feedback.height_m = found.ball_m[2] - radius_m
+            return found
+
+        result = no_table(CalibrateTable.Result.FAILED)
+        file = None
+        try:
+            with hands.at_work():
+                file = _new_file(request.file) if request.file else None
+                hands.retract()
+                made = calibrate_table(request, frames.table_in_base, radius_m, touch)
+        except (PointFailed, ScanEnded, Interrupted) as error:
+            result.message = str(error) or "cancelled"
+        except ValueError as error:
+            result.outcome, result.message = result.REFUSED, str(error)
+        else:
+            fill_calibration_result(result, made)
+            if file is not None:
+                known = {
+                    "base_frame": frames.base,
+                    "table_frame": frames.table,
+                    "known_table_in_base": frames.table_in_base.vector.tolist(),
+                    "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+                    "made_by": who,
+                }
+                try:
+                    file.write(as_text(made, request, known).encode())
+                    file.flush()
+                    os.fsync(file.fileno())
+                    result.file = request.file
+                except OSError as error:
+                    result.message += f". NOT WRITTEN: {error}"
+        finally:
+            if file is not None:
+                file.close()
+                if not result.file:
+                    Path(request.file).unlink()
         if result.outcome != result.DONE:
             self.health.error(result.message)
         return result
@@ -302,8 +219,7 @@ class ScanNode(ManagedNode):
     def _scan(self, goal: ServerGoalHandle, frames: Frames) -> Scan.Result:
         result = Scan.Result(outcome=Scan.Result.REFUSED)
         try:
-            with self._time.conducted():
-                self._hands.meet()
+            with self._hands.at_work():
                 self._run(goal, frames, result)
         except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
             result.message = str(error) or "cancelled before the first point"
@@ -375,6 +291,17 @@ class ScanNode(ManagedNode):
         goal = self._goals.handle
         if goal is not None:
             goal.publish_feedback(scan_feedback(progress, self._run_directory))
+
+
+def _new_file(name: str) -> BinaryIO:
+    """Open a new file before anything is touched; ``ValueError`` where there can be none."""
+    path = Path(name)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path.open("xb")
+    except OSError as error:
+        accepted = f"a new file in a folder that can be written ({error.strerror})"
+        raise ValueError(f"file: got {name!r}; accepted is {accepted}") from error
 
 
 main = ScanNode.run

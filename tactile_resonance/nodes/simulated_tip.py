@@ -6,9 +6,15 @@ The true poles there are on the topic `bench/truth` and behind the service `benc
 
 from __future__ import annotations
 
+import select
+import subprocess
+import sys
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +24,6 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from tactile_resonance import msg
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.vectors import Vector, vector
-from tactile_resonance.nodes.bench_player import PlantChild
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import (
     poles_to_message,
@@ -29,6 +34,7 @@ from tactile_resonance.nodes.messages import (
 from tactile_resonance.nodes.parameters import pose_of, values
 from tactile_resonance.nodes.running import PLACES, STREAM, TRUTHS
 from tactile_resonance.poles.result import Poles, PolesStatus
+from tactile_resonance.processes import may_take_priority, start_child
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.recording.messages import (
     contact_from_message,
@@ -36,6 +42,7 @@ from tactile_resonance.recording.messages import (
     fill_complex,
     time_from_message,
 )
+from tactile_resonance.simulation.plant.defaults import PRIORITY, READY, order
 from tactile_resonance.simulation.plant.surfaces import LaidScene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, parts_of
@@ -44,8 +51,83 @@ from tactile_resonance.simulation.tissue.scene import PhantomScene
 from tactile_resonance.srv import ForceOver
 from tactile_resonance.srv import Truth as TruthService
 
+START_WITHIN_S = 90.0
+ANSWER_WITHIN_S = 10.0
+END_WITHIN_S = 3.0
 PLANT_CHECK_S = 0.5
 MOST_STAYS = 1000
+
+
+class PlantChild:
+    """Starts `tactile_resonance simulate-ur`, with tissue and load cell, as a process that ends with its owner.
+
+    Parameters
+    ----------
+    host : str
+        Address of the robot, 127.x.y.z.
+    scene : Path
+    table_in_base : six numbers
+    seed : int
+    simulated_time : bool
+        Its time goes on as those who take part in it let it; else that of the wall clock.
+
+    Raises
+    ------
+    ValueError
+        If it does not come up; with what it printed.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        scene: Path,
+        table_in_base: Sequence[float],
+        seed: int,
+        simulated_time: bool,
+    ) -> None:
+        self._host = host
+        pace = ["--priority", str(PRIORITY if may_take_priority(PRIORITY) else 0)]
+        command = [
+            *(sys.executable, "-m", "tactile_resonance.cli", "simulate-ur", "--host", host),
+            *("--scene", str(scene), "--seed", str(seed % 2**31), "--table"),
+            *(str(float(value)) for value in table_in_base),
+            *(["--simulated-time"] if simulated_time else pace),
+        ]
+        self._process = start_child(command, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        deadline = time.monotonic() + START_WITHIN_S
+        said = []
+        while time.monotonic() < deadline:
+            ready, _, _ = select.select([self._process.stdout], [], [], 0.1)
+            line = self._process.stdout.readline() if ready else ""
+            if line.startswith(READY):
+                return
+            if line.strip():
+                said.append(line.strip())
+            elif self._process.poll() is not None:
+                break
+        self.close()
+        raise ValueError(
+            f"robot_host: no simulated robot at {host}: {' '.join(said) or 'no output'}"
+        )
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    def ask(self, what: str, **arguments: object) -> dict[str, Any]:
+        """Answer of its control port; ``OSError`` where none comes."""
+        return order(self._host, what, timeout_s=ANSWER_WITHIN_S, **arguments)
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.terminate()
+        try:
+            self._process.wait(END_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import SetBool, Trigger
@@ -19,8 +19,6 @@ from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll, answe
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import HOLDS
 from tactile_resonance.nodes.running import NEWEST
-from tactile_resonance.nodes.scan_time import ScanTime
-from tactile_resonance.nodes.stop_input import STOP
 from tactile_resonance.recording.messages import PROTOCOLS, time_from_message
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
@@ -35,6 +33,9 @@ from tactile_resonance.scan.hands import (
 )
 from tactile_resonance.scan.point_outcome import StateTimes
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
+
+if TYPE_CHECKING:
+    from tactile_resonance.nodes.scan_hands import ScanTime
 
 STATE_TOPIC = "contact_state"
 UNKNOWN = msg.ContactState(tissue_moves_m=math.nan, zero_moved_n=math.nan)
@@ -85,7 +86,7 @@ class TipContact:
         for each in (client, tester):
             node.resources.callback(each.destroy)
         self._retract = node.client_of(Trigger, "retract")
-        self._stop = node.client_of(SetBool, STOP)
+        self._stop = node.client_of(SetBool, "stop")
 
     def listen(self) -> None:
         """Subscribe to contacts, for one scan; where the tip is now is unknown."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 
 from geometry_msgs.msg import WrenchStamped
@@ -14,13 +15,32 @@ from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.force_config import TopicForce
-from tactile_resonance.nodes.lockstep import Arrivals
 from tactile_resonance.nodes.running import SERIES
 from tactile_resonance.recording.messages import time_from_message
 
 EARLIEST_S = 0.005
 LATEST_S = 0.5
 FIRST_WITHIN_S = 2.0
+
+
+class Arrivals:
+    """The newest stamp of a topic, for a thread that waits for it while another spins."""
+
+    def __init__(self) -> None:
+        self.newest_ns = 0
+        self.lost = False
+        self._changed = threading.Condition()
+
+    def add(self, stamp_ns: int) -> None:
+        """Take the stamp of a message [ns]."""
+        with self._changed:
+            self.newest_ns, self.lost = stamp_ns, False
+            self._changed.notify_all()
+
+    def wait(self, stamp_ns: int, seconds: float) -> bool:
+        """Wait for a stamp or a later one; whether it has come within so many seconds."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self.newest_ns >= stamp_ns, seconds)
 
 
 class TopicWrench:

@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rosgraph_msgs.msg import Clock as ClockMessage
 
-from tactile_resonance.clock import Clock, WallClock
+from tactile_resonance.clock import Clock, Demand, WallClock
 from tactile_resonance.contact.interfaces import (
     ArmError,
     ArmFault,
@@ -40,14 +42,19 @@ from tactile_resonance.drivers.twist import (
     towards,
     velocity_of,
 )
-from tactile_resonance.nodes.lockstep import Arrivals, Lockstep
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
-from tactile_resonance.nodes.running import COMMANDS, SERIES, STEADY, RCLError
-from tactile_resonance.nodes.topic_wrench import EARLIEST_S, TopicWrench
+from tactile_resonance.nodes.running import COMMANDS, PLACES, SERIES, STEADY, RCLError
+from tactile_resonance.nodes.topic_wrench import EARLIEST_S, Arrivals, TopicWrench
 from tactile_resonance.recording.messages import time_from_message
 
 CLOSE_WITHIN_S = 2.0
+COMMANDS_END_NS = 200_000_000
+"""Without a command for so long no contact is under way: in one a stop is repeated sooner [ns]."""
+KEPT_POSES = 64
+POLL_S = 0.1
+LOST_S = 1.0
+"""What a step has not brought by then, on the machine's clock, is lost and no longer waited for [s]."""
 
 
 class Listener:
@@ -92,8 +99,57 @@ class Listener:
             return
 
 
-COMMANDS_END_NS = 200_000_000
-"""Without a command for so long no contact is under way: in one a stop is repeated sooner [ns]."""
+class Lockstep(LoopClock):
+    """The clock of a loop that a simulated controller leads, and that leads it, as fast as it can.
+
+    The controller publishes what a step brought, then the time of the step on the topic `clock`, and goes on
+    only when a command with that stamp has come. So neither is ever late, however slow the machine is.
+
+    Parameters
+    ----------
+    node : Node
+    answer : callable
+        Publishes the command that holds, with the stamp that it is given [ns].
+
+    Attributes
+    ----------
+    awaited : sequence of Arrivals
+        What every step brings.
+    while_waiting : callable
+        Called every tenth of a second of this machine's time while simulated time stands.
+    """
+
+    def __init__(self, node: Node, answer: Callable[[int], None]) -> None:
+        self.awaited: Sequence[Arrivals] = ()
+        self.while_waiting: Callable[[], None] = lambda: None
+        self._answer = answer
+        self._steps = Arrivals()
+        self._now_ns = 0
+        node.create_subscription(
+            ClockMessage,
+            "clock",
+            lambda message: self._steps.add(time_from_message(message.clock)),
+            PLACES,
+        )
+
+    def now_ns(self) -> int:
+        """Time of the newest step whose data are here [ns]."""
+        return self._now_ns
+
+    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
+        """Answer step after step until a time is reached and its data are here."""
+        while self._now_ns < time_ns:
+            self._answer(self._now_ns)
+            while not self._steps.wait(self._now_ns + 1, POLL_S):
+                self.while_waiting()
+                self._answer(self._now_ns)  # a controller that has just come up has not heard it
+            step_ns = self._steps.newest_ns
+            for arrivals in self.awaited:
+                lost_s = time.monotonic() + LOST_S
+                while not arrivals.lost and not arrivals.wait(step_ns, POLL_S):
+                    self.while_waiting()
+                    arrivals.lost = time.monotonic() > lost_s
+            self._now_ns = step_ns
 
 
 class TwistArm:
@@ -131,7 +187,7 @@ class TwistArm:
         self._offset_turn = config.tip_in_tool.turn
         self._lock = threading.Lock()  # of fault and twist: two threads may set them
         self._fault: ArmError | None = None
-        self._tools = _no_tools()
+        self._tools: deque[ToolPose] = deque(maxlen=KEPT_POSES)
         self._twist = REST  # of the tip, after the limit of acceleration
         self._commanded_ns: int | None = None  # when the last command was given
         self._moving = False
@@ -147,7 +203,7 @@ class TwistArm:
         """Forget the fault; nothing moves before the next command."""
         with self._lock:
             self._fault = None
-            self._tools = _no_tools()  # the listener's thread may be looking at the old ones
+            self._tools = deque(maxlen=KEPT_POSES)  # the listener's thread may be looking at the old ones
             self._twist, self._moving, self._commanded_ns = REST, False, None
         self._following.forget()
 
@@ -333,7 +389,3 @@ class TwistArm:
             except RCLError:
                 # once ROS has been shut down nobody listens, and the controller's own limit stops the arm
                 return
-
-
-def _no_tools() -> deque[ToolPose]:
-    return deque(maxlen=64)

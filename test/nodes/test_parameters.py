@@ -101,19 +101,17 @@ def test_what_is_out_of_range_is_refused_with_a_reason(ros, node, name, value):
 def test_compressed_phases_for_one_realisation_only(ros):
     from tactile_resonance.action import Measure
 
-    from tactile_resonance.nodes import excitation_design
-
     node = excitation_node.ExcitationNode()
     try:
         node.set_parameters([RosParameter("compression_passes", value=300)])
         goal = Measure.Goal(f_max_hz=500.0)
-        (compressed,) = excitation_design.design(node, goal, 0)
+        (compressed,) = excitation_node.design(node, goal, 0)
         assert not compressed.random_phases
         assert compressed.crest_factor() < 2.2
         with pytest.raises(ValueError, match="realisations: 1000000, accepted is up to 1000"):
-            excitation_design.design(node, Measure.Goal(realisations=10**6), 0)
+            excitation_node.design(node, Measure.Goal(realisations=10**6), 0)
         with pytest.raises(ValueError, match="compressed phases are not random"):
-            excitation_design.design(node, Measure.Goal(realisations=2), 0)
+            excitation_node.design(node, Measure.Goal(realisations=2), 0)
     finally:
         node.destroy_node()
 
@@ -121,17 +119,15 @@ def test_compressed_phases_for_one_realisation_only(ros):
 def test_a_sweep_keeps_its_phases(ros):
     from tactile_resonance.action import Measure
 
-    from tactile_resonance.nodes import excitation_design
-
     node = excitation_node.ExcitationNode()
     try:
         node.set_parameters([RosParameter("compression_passes", value=300)])
         goal = Measure.Goal(f_max_hz=500.0, sweep=True, periods=2)
-        first, second = (excitation_design.design(node, goal, n)[0] for n in range(2))
+        first, second = (excitation_node.design(node, goal, n)[0] for n in range(2))
         assert not first.random_phases
         np.testing.assert_array_equal(first.period(), second.period())
         with pytest.raises(ValueError, match="realisations: got 2; accepted is 1 with sweep"):
-            excitation_design.design(node, Measure.Goal(realisations=2, sweep=True), 0)
+            excitation_node.design(node, Measure.Goal(realisations=2, sweep=True), 0)
     finally:
         node.destroy_node()
 
@@ -139,16 +135,14 @@ def test_a_sweep_keeps_its_phases(ros):
 def test_a_silent_measurement_plays_nothing(ros):
     from tactile_resonance.action import Measure
 
-    from tactile_resonance.nodes import excitation_design
-
     node = excitation_node.ExcitationNode()
     try:
         node.set_parameters([RosParameter("compression_passes", value=300)])
-        (silent,) = excitation_design.design(node, Measure.Goal(silent=True), 0)
+        (silent,) = excitation_node.design(node, Measure.Goal(silent=True), 0)
         assert not np.any(silent.period())
-        excitation_design.check_output([silent], SimpleNamespace(name="none", output_peak_v=0.0))
+        excitation_node.check_output([silent], SimpleNamespace(name="none", output_peak_v=0.0))
         with pytest.raises(ValueError, match="level_v: 1, a silent measurement plays nothing"):
-            excitation_design.design(node, Measure.Goal(silent=True, level_v=1.0), 0)
+            excitation_node.design(node, Measure.Goal(silent=True, level_v=1.0), 0)
     finally:
         node.destroy_node()
 
@@ -156,20 +150,18 @@ def test_a_silent_measurement_plays_nothing(ros):
 def test_lines_of_the_mains_are_left_out_where_the_laboratory_says_so(ros):
     from tactile_resonance.action import Measure
 
-    from tactile_resonance.nodes import excitation_design
-
     node = excitation_node.ExcitationNode()
     goal = Measure.Goal(f_min_hz=190.0, f_max_hz=310.0)
     try:
-        (whole,) = excitation_design.design(node, goal, 0)
+        (whole,) = excitation_node.design(node, goal, 0)
         node.set_parameters([RosParameter("mains_hz", value=50.0)])
-        (left,) = excitation_design.design(node, goal, 0)
+        (left,) = excitation_node.design(node, goal, 0)
         assert sorted({*whole.frequency_hz} - {*left.frequency_hz}) == [
             *(197.5, 200.0, 202.5, 247.5, 250.0, 252.5, 297.5, 300.0, 302.5)
         ]
         assert left.level_v == pytest.approx(whole.level_v)
         node.set_parameters([RosParameter("mains_hz", value=5.0)])
         with pytest.raises(ValueError, match="mains_hz: 5, expected above 7.5 Hz"):
-            excitation_design.design(node, goal, 0)
+            excitation_node.design(node, goal, 0)
     finally:
         node.destroy_node()

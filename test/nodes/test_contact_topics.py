@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The service force_over: the exact mean over a block, or why there is none; and nobody waits for it."""
+"""The service force_over, exact or with a reason and never waited for; and which poles tell a touch."""
 
 import math
 import os
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
@@ -15,12 +16,13 @@ from spinning import spin_until
 from std_srvs.srv import Trigger
 from tactile_resonance.srv import ForceOver
 
+from tactile_resonance import msg
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.nodes import force_service
-from tactile_resonance.nodes.force_service import ForceService
+from tactile_resonance.nodes import contact_topics
+from tactile_resonance.nodes.contact_topics import ForceService, TouchFromPoles
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import initialised
@@ -68,7 +70,7 @@ class Contact(ManagedNode):
 @pytest.fixture
 def served(monkeypatch):
     """The node, a client's question, and something that spins until a condition holds."""
-    monkeypatch.setattr(force_service, "WAIT_S", math.inf)
+    monkeypatch.setattr(contact_topics, "WAIT_S", math.inf)
     with initialised(domain_id=free_domain_id(os.environ)):
         node, executor = Contact(), SingleThreadedExecutor()
         node.trigger_configure()
@@ -172,8 +174,8 @@ def test_a_block_that_is_not_over_is_waited_for_and_nothing_else_waits(served):
 def test_a_loop_that_stands_is_not_waited_for_for_long(served, monkeypatch):
     told = SimpleNamespace(now_s=1000.0)
     told.monotonic = lambda: told.now_s
-    monkeypatch.setattr(force_service, "time", told)
-    monkeypatch.setattr(force_service, "WAIT_S", 0.2)
+    monkeypatch.setattr(contact_topics, "time", told)
+    monkeypatch.setattr(contact_topics, "WAIT_S", 0.2)
     served.node.run(200)
     asked = served.ask(100, 300)
     served.wait(lambda: served.node.forces._waiting)
@@ -195,3 +197,107 @@ def test_without_a_contact_there_is_no_force_and_nothing_to_wait_for(served):
     assert served.answer(300, 300).reason == "the interval is empty"
     served.node.clock = None
     assert served.answer(100, 300).reason == "contact_node is not active"
+
+
+SECOND_NS = 10**9
+UP_NS = 1000 * SECOND_NS
+AIR, GELATINE = (246.60, 0.0119), (249.0, 0.020)
+STD = np.array([0.01, 5e-5])
+
+
+def poles(pole, middle_ns, *, final=True, covariance=True):
+    damped = 2 * np.pi * pole[0]
+    message = msg.Poles(
+        final=final,
+        f0_hz=[pole[0]],
+        damping_ratio=[pole[1]],
+        real_rad_s=[-pole[1] * damped],
+        imag_rad_s=[damped],
+        residue_real=[0.0],
+        residue_imag=[1.0],
+        order=2,
+        numerator_order=2,
+    )
+    if covariance:
+        message.covariance = np.diag(STD**2).ravel().tolist()
+    message.header.stamp = time_message(int(middle_ns))
+    return message
+
+
+class Hearing:
+    """A `TouchFromPoles` with a clock that is told."""
+
+    def __init__(self, references=3):
+        self.told, self.now_ns = 0, UP_NS + 2 * SECOND_NS
+        self.rng = np.random.default_rng(2)
+        self.touch = TouchFromPoles(1e-6, UP_NS)
+        for _ in range(references):
+            self.hear(AIR, State.IDLE)
+
+    def hear(self, pole, state, length_s=0.8, passed=False, **fields):
+        """Let a measurement of so long go by, unless it has passed, and hear of it at its end."""
+        self.now_ns += 0 if passed else round(length_s * SECOND_NS)
+        self.touch.moved(state, self.now_ns)
+        pole = np.array(pole) + STD * self.rng.standard_normal(2)
+        middle_ns = self.now_ns - length_s * SECOND_NS / 2
+        touched = self.touch.hear(poles(pole, middle_ns, **fields), state, self.now_ns)
+        self.told += touched
+        return touched
+
+    def stay(self, state, seconds):
+        for _ in range(round(seconds / 0.1)):
+            self.now_ns += SECOND_NS // 10
+            self.touch.moved(state, self.now_ns)
+
+
+def test_poles_that_change_in_an_approach_tell_the_touch():
+    listener = Hearing()
+    listener.stay(State.APPROACH, 0.5)
+    for _ in range(5):
+        assert not listener.hear(AIR, State.APPROACH)
+    assert listener.hear(GELATINE, State.APPROACH)
+    assert listener.told == 1
+
+
+def test_without_three_measurements_in_air_nothing_is_told():
+    listener = Hearing(references=2)
+    # what it holds is part of what the next poles of the same measurement say again
+    listener.hear(AIR, State.IDLE, final=False)
+    assert not listener.hear(GELATINE, State.APPROACH)
+    assert listener.told == 0
+
+
+def test_measurement_that_began_in_contact_is_no_reference_and_no_touch():
+    listener = Hearing()
+    listener.stay(State.HOLD, 1.0)
+    listener.stay(State.RETRACT, 0.3)
+    listener.stay(State.IDLE, 0.3)
+    # half of it in the tissue: no reference, however far off
+    listener.hear(GELATINE, State.IDLE, length_s=1.2, passed=True)
+    # seen live: taken wholly after the contact, and yet of the contact
+    listener.stay(State.IDLE, 0.2)
+    listener.hear(GELATINE, State.IDLE, length_s=0.4, passed=True)
+    listener.stay(State.HOLD, 1.0)
+    listener.stay(State.TRAVEL, 0.2)
+    listener.stay(State.APPROACH, 0.2)
+    # it began in the last contact
+    assert not listener.hear(GELATINE, State.APPROACH, passed=True)
+    listener.stay(State.APPROACH, 0.5)
+    assert not listener.hear(AIR, State.APPROACH)
+    assert listener.hear(GELATINE, State.APPROACH)
+
+
+def test_measurement_that_began_before_all_that_is_known_is_no_reference():
+    listener = Hearing(references=0)
+    # whether the tip was in air then nobody can tell
+    listener.hear(AIR, State.IDLE, length_s=1.5, passed=True)
+    for _ in range(2):
+        listener.hear(AIR, State.IDLE)
+    listener.stay(State.APPROACH, 1.5)
+    assert not listener.hear(GELATINE, State.APPROACH)
+    assert listener.told == 0
+
+
+def test_poles_without_covariance_are_said_to_be_of_no_use():
+    with pytest.raises(ValueError, match="covariance: unknown"):
+        Hearing(references=3).hear(AIR, State.APPROACH, covariance=False)

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-from tactile_resonance.nodes import scan_node
+from tactile_resonance.nodes import scan_actions
 
 
 class Node:
@@ -32,10 +32,10 @@ def test_a_goal_accepted_as_the_node_is_deactivated_is_cancelled_at_once(monkeyp
     async def here(node, work, name):
         return work()
 
-    monkeypatch.setattr(scan_node, "in_thread", here)
-    monkeypatch.setattr(scan_node, "end_goal", lambda goal, done: None)
+    monkeypatch.setattr(scan_actions, "in_thread", here)
+    monkeypatch.setattr(scan_actions, "end_goal", lambda goal, done: None)
     node = Node(active=True)
-    goals = scan_node.OneGoal(node, contextlib.nullcontext)
+    goals = scan_actions.OneGoal(node, contextlib.nullcontext)
     monkeypatch.setattr(goals, "_require_free", lambda: None)
     cancelled = []
 
