@@ -16,18 +16,15 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.realisations import Agreement
-from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.data import TINY, BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import minimise, refit_failed
-from tactile_resonance.poles.joint_noise import TINY, rules_between, with_noise
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
-from tactile_resonance.poles.levels import Level, Levels, line_pieces, smooth_variance
+from tactile_resonance.poles.levels import Level, Levels, Spread
 from tactile_resonance.poles.likelihood import Solution, moments
-from tactile_resonance.poles.model_error import systematic_of
-from tactile_resonance.poles.noise_level import Pieces, are_flat
-from tactile_resonance.poles.realisations_spread import Spread
+from tactile_resonance.poles.model_error import are_smooth, systematic_of
+from tactile_resonance.poles.noise_level import Pieces, are_flat, line_pieces, smooth_variance
 from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
-from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
