@@ -285,13 +285,7 @@ def _judged(
 
 
 def _checked_frf(frf: FRF) -> FRF:
-    """The FRF with arrays of double precision, its variances in the shape of its response.
-
-    Raises
-    ------
-    ValueError
-        Names the field, its value, and what is accepted.
-    """
+    """The FRF with arrays of double precision, its variances in the shape of its response."""
     require_kind(frf, "frf", FRF)
     g = _numbers(frf.g, "frf.g", complex)
     frequency_hz = _checked_lines(frf.frequency_hz, "frf.frequency_hz")
@@ -317,13 +311,7 @@ def _checked_frf(frf: FRF) -> FRF:
 def _checked_spectra(
     frequency_hz: npt.ArrayLike, spectra: npt.ArrayLike, covariance: npt.ArrayLike, dof: int
 ) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-    """Lines (F,), spectra (..., 2, F) and covariance (..., 2, 2, F) of double precision.
-
-    Raises
-    ------
-    ValueError
-        Names the field, its value, and what is accepted.
-    """
+    """Lines (F,), spectra (..., 2, F) and covariance (..., 2, 2, F) of double precision."""
     lines_hz = _checked_lines(frequency_hz, "frequency_hz")
     z, c = _numbers(spectra, "spectra", complex), _numbers(covariance, "covariance", complex)
     lines = lines_hz.size
@@ -359,13 +347,7 @@ def _checked_spectra(
 
 
 def _checked_lines(frequency_hz: npt.ArrayLike, name: str) -> FloatArray:
-    """(F,) float, ascending from 0 or above.
-
-    Raises
-    ------
-    ValueError
-        Names the first line that is not finite, negative or not above the one before.
-    """
+    """(F,) float, ascending from 0 or above; ``ValueError`` naming the first line that is not."""
     lines_hz = _numbers(frequency_hz, name, float)
     if lines_hz.ndim != 1:
         raise ValueError(f"{name}: shape {lines_hz.shape}, expected (F,)")
@@ -381,13 +363,7 @@ def _checked_lines(frequency_hz: npt.ArrayLike, name: str) -> FloatArray:
 def _checked_band(
     frequency_hz: FloatArray, band_hz: tuple[float, float] | None
 ) -> tuple[float, float]:
-    """(low, high): all lines where nothing is asked for.
-
-    Raises
-    ------
-    ValueError
-        If the band is no pair of ascending numbers.
-    """
+    """(low, high): all lines where nothing is asked for."""
     if band_hz is None:
         lines_hz = frequency_hz if frequency_hz.size else np.full(1, np.nan)
         return float(lines_hz[0]), float(lines_hz[-1])
