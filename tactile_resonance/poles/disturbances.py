@@ -241,6 +241,7 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
     if "local polynomial" not in frf.method or frf.periods < 2 or poles.f0_hz.size == 0:
         return poles
     left = max(_beside(frf, poles, k) for k in range(poles.f0_hz.size))
+    half_width, note = _half_width(frf, poles), ""
     if left > 0:
         note = (
             f"beside the mode the output's variance is {left:.3g} times that of the other lines: the "
@@ -248,8 +249,12 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
             "the joint method, more periods, or drop the first"
         )
         poles = _doubted(frf, poles)
-    else:
-        note = _light_damping(frf, poles)
+    elif np.any(half_width < FEWEST_BINS):
+        note = (
+            f"half the width of the mode is {half_width.min():.1f} bins, less than {FEWEST_BINS}: "
+            "unless the record began settled, what the local polynomial method leaves of the transient "
+            "biases the poles"
+        )
     return poles.noting(note)
 
 
@@ -286,20 +291,6 @@ def _beside(frf: FRF, poles: Poles, mode: int) -> float:
     ratio = float(variance[order[:near]].mean()) / mean
     alarm = TRANSIENT_FALSE_ALARM / poles.f0_hz.size
     return ratio if ratio > special.fdtri(2 * near * dof, 2 * far.size * dof, 1 - alarm) else 0.0
-
-
-def _light_damping(frf: FRF, poles: Poles) -> str:
-    """Where the transient of a mode is too narrow for the local polynomials that removed it."""
-    if frf.frequency_hz.size < 2:
-        return ""
-    half_width = _half_width(frf, poles)
-    if not np.any(half_width < FEWEST_BINS):
-        return ""
-    return (
-        f"half the width of the mode is {half_width.min():.1f} bins, less than {FEWEST_BINS}: "
-        "unless the record began settled, what the local polynomial method leaves of the transient "
-        "biases the poles"
-    )
 
 
 def _half_width(frf: FRF, poles: Poles) -> FloatArray:

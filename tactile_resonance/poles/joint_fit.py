@@ -20,7 +20,7 @@ from tactile_resonance.poles.data import TINY, BinData, rules_between, with_nois
 from tactile_resonance.poles.fit import minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
-from tactile_resonance.poles.levels import Level, Levels, Spread
+from tactile_resonance.poles.levels import Levels, Spread, level_of
 from tactile_resonance.poles.likelihood import Solution, moments
 from tactile_resonance.poles.model_error import are_smooth, systematic_of
 from tactile_resonance.poles.noise_level import Pieces, are_flat, line_pieces, smooth_variance
@@ -251,18 +251,20 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     solution, data = fitted.solution, fitted.data
     theta, inverse = solution.theta[:, 0], solution.marginal[:, 0]
     batch = len(theta)
-    level = Level.of(plan, solution, fitted.noise, fitted.kind == 2)
-    residual = solution.residual[:, 0] * (1 / np.sqrt(level.scale))[:, None]
-    suspect = are_smooth(residual, plan.structure.parameters) | level.suspect
+    scale, cost, expected, suspect, noise, correction = level_of(
+        plan, solution, fitted.noise, fitted.kind == 2
+    )
+    residual = solution.residual[:, 0] * (1 / np.sqrt(scale))[:, None]
+    suspect = are_smooth(residual, plan.structure.parameters) | suspect
     asked = _may_return(solution)
     if batch > 1:
-        asked &= suspect | asks(plan, level.cost, level.expected, residual)
+        asked &= suspect | asks(plan, cost, expected, residual)
     lack = Lack.of(plan, data, solution, asked)
     suspect = suspect | np.isfinite(lack.found[:, 0])
     doubted = suspect | (lack.chi_square > 0)
     if doubted.any():  # what rounding leaves of exact data says nothing
         rows = np.flatnonzero(doubted)
-        of_noise = (level.scale * data.variance_y.min(axis=1))[rows]
+        of_noise = (scale * data.variance_y.min(axis=1))[rows]
         doubted[rows] = of_noise > ROUNDED * _mean_power(data.rows(rows))
         suspect &= doubted
         lack.found[~suspect] = np.nan
@@ -270,7 +272,7 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     # others are fitted once more
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
-    covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
+    covariance = inverse * (0.5 * scale * correction)[:, None, None]
     known = plan.level_known
     return Judged.of(
         plan,
@@ -279,14 +281,14 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         condition_number=solution.condition,
         converged=solution.converged,
         residual=residual,
-        cost=level.cost,
-        expected_cost=level.expected,
+        cost=cost,
+        expected_cost=expected,
         suspect=suspect,
         covariance=covariance if known else np.full_like(covariance, np.nan),
         total=None if known else covariance,
         kind=fitted.kind,
         level_known=np.full(batch, known),
-        noise_variance=level.noise,
+        noise_variance=noise,
         systematic=systematic_of(plan, data, solution.theta, wrong),
         lacking=lack.found,
         doubt=lack.doubt,

@@ -49,73 +49,56 @@ FEWEST_RECORDS = 4
 INSIDE = 0.95
 
 
-@dataclass(frozen=True, eq=False)
-class Level:
-    """Noise level of points of one record, in units of the variances weighted with.
+def level_of(
+    plan: JointPlan, solution: Solution, noise: FloatArray, by_piece: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:
+    """Noise level that a fit of points of one record each shows, and whether it contradicts the model.
 
-    Attributes
+    Without bins between harmonics it is from the residuals, and a model error hides in it unless they
+    are smooth. With such bins these give the level, and the excited ones whether the model holds.
+
+    Parameters
     ----------
+    plan : JointPlan
+    solution : Solution
+    noise : (batch, 2) float
+        Mean variances of Y and U weighted with.
+    by_piece : (batch,) bool
+        Where the variances are from each of the pieces of the band alone.
+
+    Returns
+    -------
     scale : (batch,) float
-        Level that covariances are of.
+        Level that covariances are of, in units of the variances weighted with.
     cost, expected, suspect, noise
         See `judgement.Judged`.
     correction : (batch,) float
         Factor of the covariance for a level that is not known exactly.
     """
-
-    scale: FloatArray
-    cost: FloatArray
-    expected: FloatArray
-    suspect: BoolArray
-    noise: FloatArray
-    correction: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        plan: JointPlan,
-        solution: Solution,
-        noise: FloatArray,
-        by_piece: BoolArray,
-    ) -> Level:
-        """Level of a fit.
-
-        Without bins between harmonics it is from the residuals, and a model error hides in it unless they
-        are smooth. With such bins these give the level, and the excited ones whether the model holds.
-
-        Parameters
-        ----------
-        plan : JointPlan
-        solution : Solution
-        noise : (batch, 2) float
-            Mean variances of Y and U weighted with.
-        by_piece : (batch,) bool
-            Where the variances are from each of the pieces of the band alone.
-        """
-        batch, _, n = solution.theta.shape
-        lines, others = plan.excited_at.size, plan.others_at.size
-        if others == 0:
-            dof = np.full(batch, max(lines - n / 2, 0.5))
-            scale, nothing = solution.cost / dof, np.full(batch, np.nan)
-            no = np.zeros(batch, bool)
-            return cls(scale, nothing, nothing, no, noise * scale[:, None], student_variance(dof))
-        used = solution.leverage[:, 0]
-        dof_o = others - used / 2
-        dof_e = lines - (n - used) / 2
-        dof = dof_e + dof_o
-        level = solution.part_cost[:, 0] / dof_o
-        cost = solution.part_cost[:, 1] / level
-        expected = dof_e * dof_o / (dof_o - 1)
-        suspect = is_rare(cost / dof_e, dof_e, dof_o, MODEL_ERROR_PROBABILITY)
-        correction = student_variance(dof)
-        if by_piece.any():
-            mean, std = moments_of_ratio(BINS_PER_BAND)  # weights are from few bins
-            limit = dof_e * mean - np.sqrt(dof_e) * std * special.ndtri(MODEL_ERROR_PROBABILITY)
-            expected = np.where(by_piece, expected * mean, expected)
-            suspect = np.where(by_piece, cost > limit, suspect)
-            correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
-        scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
-        return cls(scale, cost, expected, suspect, noise * level[:, None], correction)
+    batch, _, n = solution.theta.shape
+    lines, others = plan.excited_at.size, plan.others_at.size
+    if others == 0:
+        dof = np.full(batch, max(lines - n / 2, 0.5))
+        scale, nothing = solution.cost / dof, np.full(batch, np.nan)
+        no = np.zeros(batch, bool)
+        return scale, nothing, nothing, no, noise * scale[:, None], student_variance(dof)
+    used = solution.leverage[:, 0]
+    dof_o = others - used / 2
+    dof_e = lines - (n - used) / 2
+    dof = dof_e + dof_o
+    level = solution.part_cost[:, 0] / dof_o
+    cost = solution.part_cost[:, 1] / level
+    expected = dof_e * dof_o / (dof_o - 1)
+    suspect = is_rare(cost / dof_e, dof_e, dof_o, MODEL_ERROR_PROBABILITY)
+    correction = student_variance(dof)
+    if by_piece.any():
+        mean, std = moments_of_ratio(BINS_PER_BAND)  # weights are from few bins
+        limit = dof_e * mean - np.sqrt(dof_e) * std * special.ndtri(MODEL_ERROR_PROBABILITY)
+        expected = np.where(by_piece, expected * mean, expected)
+        suspect = np.where(by_piece, cost > limit, suspect)
+        correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
+    scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
+    return scale, cost, expected, suspect, noise * level[:, None], correction
 
 
 @dataclass(frozen=True, eq=False)
