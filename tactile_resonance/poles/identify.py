@@ -12,6 +12,7 @@ import numpy.typing as npt
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.poles.data import ROUNDED
 from tactile_resonance.poles.disturbances import poles_without_tones, with_transient_judged
 from tactile_resonance.poles.judgement import Judged, assemble, single
 from tactile_resonance.poles.lacking import FEWEST_OF_A_LINE, Lack
@@ -26,8 +27,6 @@ from tactile_resonance.poles.noise_level import KINDS, student_variance
 from tactile_resonance.poles.result import Poles, PolesBatch
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
 
-# Mean square of the residuals over that of the data, below which they are rounding.
-ROUNDED = 1e-22
 # Of a covariance that is Hermitian and positive semidefinite but for rounding to single precision.
 ROUNDING = 1e-5
 

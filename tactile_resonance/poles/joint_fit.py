@@ -16,22 +16,26 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.realisations import Agreement
-from tactile_resonance.poles.data import TINY, BinData, rules_between, with_noise
+from tactile_resonance.poles.data import ROUNDED, TINY, BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
 from tactile_resonance.poles.levels import Levels, Spread, level_of
 from tactile_resonance.poles.likelihood import Solution, moments
 from tactile_resonance.poles.model_error import are_smooth, systematic_of
-from tactile_resonance.poles.noise_level import Pieces, are_flat, line_pieces, smooth_variance
+from tactile_resonance.poles.noise_level import (
+    Pieces,
+    are_flat,
+    line_pieces,
+    smooth_variance,
+    student_variance,
+)
 from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
 
-# Of the power of the data: residuals below are rounding.
-ROUNDED = 1e-22
 # How often the noise of one record is taken anew, and the change of its variance below which it is the same.
 MOST_RETURNS = 4
 SAME_LEVEL = 0.1
@@ -164,12 +168,29 @@ class _Round:
         return moments(self.plan.problem.tables, changed, self.solution.theta)[2][:, :, 1]
 
     def covariances(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Of the shared coefficients, from noise and in total; see `Levels.covariances`."""
-        noise = None
-        if self.share is not None and self.data.undriven:
-            noise = self.normal_of_excited(self.share)
-        shared = sum(self.plan.problem.sizes[:2])
-        return self.levels.covariances(self.solution, shared, suspect, noise)
+        """(batch, s, s) of the coefficients that realisations share, from noise and in total."""
+        solution, levels, shared = self.solution, self.levels, sum(self.plan.problem.sizes[:2])
+        level, dof = levels.residual_level(suspect)
+        between, between_dof = levels.noise_level(suspect)
+        pieces = np.where(levels.piece_dof > 2, levels.piece_dof / (levels.piece_dof - 2), 1.0)
+        first, last = solution.normal[:, :, 0], solution.normal[:, :, 1]
+        noise = solution.marginal[:, 0, :shared, :shared]
+        if np.isnan(levels.between_dof).all():
+            both = 0.5 * (level * student_variance(dof) * pieces)[:, None, None]
+            return both * noise, both * noise
+        if self.share is None:  # there is no less than the noise
+            more = np.maximum(level / between, 1.0)
+        else:
+            between, between_dof = levels.between, levels.between_dof
+            more = level / between
+            noise = solution.sandwich(first + self.normal_of_excited(self.share), shared)
+        total = solution.sandwich(first + last * more[:, None, None, None], shared)
+        scale = 0.5 * between * pieces
+        total_dof = np.where(more == 1, between_dof, dof)
+        return (
+            noise * (scale * student_variance(between_dof))[:, None, None],
+            total * (scale * student_variance(total_dof))[:, None, None],
+        )
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")

@@ -219,7 +219,7 @@ class Levels:
         chance = special.fdtrc(2 * self.excited_dof, 2 * self.between_dof, self.excited / self.between)
         return np.asarray(chance < DISTORTION_PROBABILITY)
 
-    def _residual_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def residual_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(batch,) level of the excited lines and its degrees of freedom.
 
         With what realisations have in common, where that is no model error.
@@ -232,53 +232,13 @@ class Levels:
 
     def noise_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(batch,) of the noise, and its dof; without bins between harmonics of noise and distortion."""
-        level, dof = self._residual_level(suspect)
+        level, dof = self.residual_level(suspect)
         if np.isnan(self.between_dof).all():
             return level, dof
         both = self.between_dof + dof
         pooled = (self.between * self.between_dof + level * dof) / both
         apart = self.distorted()
         return np.where(apart, self.between, pooled), np.where(apart, self.between_dof, both)
-
-    def covariances(
-        self, solution: Solution, shared: int, suspect: BoolArray, noise_normal: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Covariances (batch, s, s) of the shared coefficients, from noise and in total.
-
-        Parameters
-        ----------
-        solution : Solution
-        shared : int
-            How many coefficients realisations share.
-        suspect : (batch,) bool
-            Where the model is in error.
-        noise_normal : (batch, M, n, n) float or None
-            Covariance of the gradient on excited lines from their noise alone; None where that is
-            all they were weighted with.
-        """
-        level, dof = self._residual_level(suspect)
-        between, between_dof = self.noise_level(suspect)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            nu = self.piece_dof
-            pieces = np.where(nu > 2, nu / (nu - 2), 1.0)
-            first, last = solution.normal[:, :, 0], solution.normal[:, :, 1]
-            noise = solution.marginal[:, 0, :shared, :shared]
-            if np.isnan(self.between_dof).all():
-                both = 0.5 * (level * student_variance(dof) * pieces)[:, None, None]
-                return both * noise, both * noise
-            if noise_normal is not None:
-                between, between_dof = self.between, self.between_dof
-                noise = solution.sandwich(first + noise_normal, shared)
-            more = level / between
-            if noise_normal is None:  # there is no less than the noise
-                more = np.maximum(more, 1.0)
-            total = solution.sandwich(first + last * more[:, None, None, None], shared)
-            scale = 0.5 * between * pieces
-            total_dof = np.where(more == 1, between_dof, dof)
-            return (
-                noise * (scale * student_variance(between_dof))[:, None, None],
-                total * (scale * student_variance(total_dof))[:, None, None],
-            )
 
 
 def _taken_by_transients(plan: JointPlan, solution: Solution, variance: FloatArray) -> FloatArray:
