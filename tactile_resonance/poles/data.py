@@ -1,14 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data of points on the bins of a band, or on the lines of an FRF."""
+"""Data of points on the bins of a band, or on the lines of an FRF, and the noise they are weighted with.
+
+Bins between harmonics of a periodic excitation show the noise on both channels. The records of a point pool
+their noise.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance.poles.likelihood import FEWEST_PIECES, TINY, Rules
+from tactile_resonance.poles.noise_level import (
+    FALSE_ALARM,
+    Pieces,
+    are_flat,
+    flat_limit,
+    model_variance,
+)
+
+if TYPE_CHECKING:
+    from tactile_resonance.poles.joint import JointPlan
+
+# Bins whose powers are averaged before their variances are compared with each other.
+BINS_PER_BAND = 8
+# Disturbances that the response explains somewhat are taken for the generator's, unless one gain for all
+# bins leaves so much less of the error.
+MUCH_MORE = 1.5
+# Mean square of the residuals over that of the data, below which they are rounding.
+ROUNDED = 1e-22
 
 
 class BinData(NamedTuple):
@@ -134,3 +158,140 @@ def _plain(values: npt.ArrayLike, kind: type) -> npt.NDArray:
     """Contiguous and writable, as compiled functions take arrays."""
     array: npt.NDArray = np.ascontiguousarray(values, kind)
     return array if array.flags.writeable else array.copy()
+
+
+def _pieces_between(bins: int, records: int) -> Pieces:
+    """Pieces of `BINS_PER_BAND` values on bins between harmonics, or a few more, the last one longer."""
+    size = -(-BINS_PER_BAND // records)
+    return Pieces.of(bins, size, records, records)
+
+
+@lru_cache(maxsize=64)
+def rules_between(bins: int, records: int) -> Rules:
+    """Of fits that find the noise on so many bins themselves, where it is flat."""
+    pieces = _pieces_between(bins, records)
+    return Rules(
+        pieces=pieces.starts.size,
+        size=pieces.size,
+        chance=_correlation_limit(bins * records),
+        flat=flat_limit(pieces.starts.size, pieces.dof),
+    )
+
+
+def with_noise(
+    plan: JointPlan, data: BinData, theta: FloatArray
+) -> tuple[BinData, FloatArray, IntArray]:
+    """Data weighted with the noise that their bins between harmonics show.
+
+    Parameters
+    ----------
+    plan : JointPlan
+    data : BinData
+        Weights do not matter.
+    theta : (points, M, n) float
+        Coefficients whose errors show it.
+
+    Returns
+    -------
+    BinData
+        With the variances, and without what came through the input.
+    mean : (points, 2) float
+        Variances of what remains on Y between harmonics, and of that on U which is not real excitation.
+    kind : (points,) int
+        Index into `noise_level.KINDS`.
+
+    Notes
+    -----
+    Noise of the two voltmeters is independent. Where U and Y are correlated beyond chance the
+    disturbance either went through the system (noise of the generator: then it is a known input, no
+    measurement noise) or into both channels alike; the first is taken where it explains some of Y and
+    the second not much more.
+    """
+    problem, records = plan.problem, data.records
+    alpha, beta, gamma = problem.split(theta)
+    others = data.order[: data.undriven]
+    of_a = alpha[:, 0] @ problem.denominator[: data.undriven].T  # (points, K_o)
+    transient = gamma @ problem.transient[: data.undriven].T / of_a[:, None]
+    error = _bin_by_bin(data.y[..., others] - transient)  # (points, K_o M)
+    u = _bin_by_bin(np.broadcast_to(data.u, data.y.shape)[..., others])
+    response = beta[:, 0] @ plan.numerator_on_bins[plan.others_at].T / of_a
+    power_error, power_u, cross, correlated = _powers(error, u)
+    by_g, gain = response.repeat(records, axis=1) * u, cross / np.maximum(power_u, TINY)
+    rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
+    generator = correlated & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
+    common = correlated & ~generator
+    through = np.where(generator, by_g, np.where(common, gain * u, 0.0))
+    rest, size = error - through, error.shape[1]
+    free = size / max(size - problem.sizes[2] * records / 2, 1.0)  # of what the transients have left
+    pieces = _pieces_between(data.undriven, records)
+    total_power, _ = _by_piece(error, pieces, free)
+    rest_power, kind_rest = _by_piece(rest, pieces, free)
+    input_power, kind_u = _by_piece(u, pieces, 1.0)
+    measured = np.where(common, total_power, rest_power)
+    variance_u = np.where(generator, 0.0, input_power)
+    if correlated.any():
+        y = data.y.copy()
+        y[..., others] -= through.reshape(len(y), -1, records).swapaxes(1, 2)
+        data = data._replace(y=y)
+    before = np.searchsorted(plan.others_at, plan.excited_at)
+    of_excited = pieces.of_bin[np.minimum(before, data.undriven - 1)]
+    weighted = data.weighted(
+        rest=_on(pieces.of_bin, np.where(rest_power > TINY, rest_power, 1.0)),
+        variance_y=_on(of_excited, np.where(measured > TINY, measured, 1.0)),
+        variance_u=_on(of_excited, variance_u),
+        covariance_yu=np.where(common, cross, 0.0) if common.any() else np.empty((len(data.y), 0)),
+    )
+    mean = np.concatenate([_mean_power(rest) * free, variance_u.mean(-1, keepdims=True)], -1)
+    return weighted, mean, np.maximum(kind_rest, np.where(generator[:, 0], 0, kind_u))
+
+
+def _bin_by_bin(values: ComplexArray) -> ComplexArray:
+    """(points, K M) of (points, M, K): the records of a bin side by side."""
+    return np.ascontiguousarray(values.swapaxes(1, 2).reshape(len(values), -1))
+
+
+def _on(pieces: IntArray, variance: FloatArray) -> FloatArray:
+    """(points, 1) or (points, K) variance of bins from that of their pieces."""
+    return variance if variance.shape[1] == 1 else np.ascontiguousarray(variance[:, pieces])
+
+
+def _correlation_limit(size: int) -> float:
+    """Squared correlation of so many complex samples that is beyond chance."""
+    # chance exceeds x with (1 - x)^(n - 1)
+    return float(1 - FALSE_ALARM ** (1 / max(size - 1, 1)))
+
+
+def rough_noise(error: ComplexArray, u: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """(batch, 1) flat variances of Y and of U from the same; none of U where it shows in `error`."""
+    of_error, of_u, _, correlated = _powers(error, u)
+    return np.where(of_error > TINY, of_error, 1.0), np.where(correlated, 0.0, of_u)
+
+
+def _powers(
+    error: ComplexArray, u: ComplexArray
+) -> tuple[FloatArray, FloatArray, ComplexArray, BoolArray]:
+    """(batch, 1) mean powers of errors and inputs, of their product, and whether they are correlated."""
+    power_error, power_u = _mean_power(error), _mean_power(u)
+    cross = np.mean(error * u.conj(), axis=-1, keepdims=True)
+    squared = np.abs(cross) ** 2 / np.maximum(power_error * power_u, TINY)
+    return power_error, power_u, cross, np.asarray(squared > _correlation_limit(error.shape[1]))
+
+
+def _by_piece(
+    values: ComplexArray, pieces: Pieces, factor: float
+) -> tuple[FloatArray, IntArray]:
+    """(batch, 1) or (batch, pieces) variance, and its kind as index into `KINDS`.
+
+    Flat unless a test says otherwise.
+    """
+    mean = _mean_power(values) * factor
+    samples = pieces.means(values.real**2 + values.imag**2)
+    if pieces.starts.size < FEWEST_PIECES or bool(are_flat(samples, pieces.dof).all()):
+        return mean, np.zeros(mean.shape[0], np.int64)
+    model = model_variance(samples * factor, pieces.dof)
+    return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
+
+
+def _mean_power(values: ComplexArray) -> FloatArray:
+    """(batch, 1)."""
+    return np.asarray(np.mean(values.real**2 + values.imag**2, axis=-1, keepdims=True))

@@ -288,11 +288,11 @@ def _poles_with_all_bins(
     wrong = batch.status() is PolesStatus.MODEL_ERROR and not np.isfinite(batch.lacking[0])
     if batch.status() is PolesStatus.TOO_FEW_LINES or not _disturbed(plan, u):
         return None
-    ratio = 0.0
-    of_all = _with_all_bins(plan, u, y, ratio)
+    plan_of_all = replace(plan, harmonics=None, input_noise_ratio=0.0)
+    of_all = plan_of_all.from_bins(u, y)
     for _ in range(FITS - 1):
-        ratio = _input_noise_ratio(plan, of_all, ratio)
-        of_all = _with_all_bins(plan, u, y, ratio)
+        plan_of_all = replace(plan_of_all, input_noise_ratio=_input_noise_ratio(plan_of_all, of_all))
+        of_all = plan_of_all.from_bins(u, y)
     if wrong and not of_all.noise_variance[0] * EXPLAINED < batch.noise_variance[0]:
         return None
     explained = _explained(plan, of_all, u)
@@ -321,18 +321,14 @@ def _disturbed(plan: JointPlan, u: ComplexArray) -> bool:
     return bool(DISTURBED * lines <= np.mean(power[..., plan.others_at]) < np.inf)
 
 
-def _with_all_bins(plan: JointPlan, u: ComplexArray, y: ComplexArray, ratio: float) -> PolesBatch:
-    return replace(plan, harmonics=None, input_noise_ratio=ratio).from_bins(u, y)
-
-
 @np.errstate(all="ignore")
-def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch, ratio: float) -> float:
+def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch) -> float:
     """Variance of the noise on U over that on Y, from residuals whose power is ``a + b |G|^2``.
 
-    Of a fit weighted with another ratio.
+    Of a fit weighted with the ratio of its plan.
     """
     gain = np.abs(of_all.fit.response(plan.frequency_hz)) ** 2
-    variance = np.abs(of_all.residual) ** 2 * (1 + ratio * gain)
+    variance = np.abs(of_all.residual) ** 2 * (1 + (plan.input_noise_ratio or 0.0) * gain)
     curve = two_channels(variance[None], gain[None])[0]
     low, high = np.argmin(gain), np.argmax(gain)
     slope = (curve[high] - curve[low]) / max(gain[high] - gain[low], np.finfo(float).tiny)

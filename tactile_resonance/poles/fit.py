@@ -9,6 +9,7 @@ does not converge, has many poles or a pure delay is fitted by scipy's least squ
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,9 @@ from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.likelihood import ROUNDING, STEP_TOLERANCE, Rules, Solution
-from tactile_resonance.poles.tables import Problem
+
+if TYPE_CHECKING:
+    from tactile_resonance.poles.tables import Problem
 
 ORDINARY = Rules()
 # Of a fit at full precision.

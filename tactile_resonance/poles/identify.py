@@ -4,41 +4,31 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from scipy import special
+import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
+from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.poles.data import ROUNDED
+from tactile_resonance.poles.disturbances import poles_without_tones, with_transient_judged
 from tactile_resonance.poles.judgement import Judged, assemble, single
 from tactile_resonance.poles.lacking import FEWEST_OF_A_LINE, Lack
 from tactile_resonance.poles.lines import (
+    LinesPlan,
     WeightedLines,
-    checked_band,
-    checked_frf,
-    checked_spectra,
     lines_of_frf,
     lines_of_spectra,
 )
-from tactile_resonance.poles.lines_fit import LinesPlan
-from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, systematic_of
-from tactile_resonance.poles.modes import in_any_direction
+from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, are_smooth, systematic_of
 from tactile_resonance.poles.noise_level import KINDS, student_variance
-from tactile_resonance.poles.outliers import poles_without_tones
-from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
+from tactile_resonance.poles.result import Poles, PolesBatch
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
-from tactile_resonance.poles.whiteness import are_smooth
 
-# Mean square of the residuals over that of the data, below which they are rounding.
-ROUNDED = 1e-22
-# Half the width of a mode, in bins, from which a polynomial of order 2 follows its transient at 40 dB.
-FEWEST_BINS = 16
-# A record without a transient is suspected once in ten thousand times.
-TRANSIENT_FALSE_ALARM = 1e-4
-FEWEST_NEAR = 3
-# Deviation in bins of a mode of less than so many, beside what the variance shows: a transient that is left
-# changes its shape, by .28 bins of half width at most.
-NARROW, UNRESOLVED = 2.0, 0.25
+# Of a covariance that is Hermitian and positive semidefinite but for rounding to single precision.
+ROUNDING = 1e-5
 
 
 def identify_frf(
@@ -74,8 +64,8 @@ def identify_frf(
         raise ValueError(
             f"frf.g: shape {np.shape(frf.g)}, expected (F,); identify_batch takes batches"
         )
-    frf = checked_frf(frf)
-    selected = frf.band(*checked_band(frf.frequency_hz, band_hz))
+    frf = _checked_frf(frf)
+    selected = frf.band(*_checked_band(frf.frequency_hz, band_hz))
     batch, tones = poles_without_tones(
         lambda lines: identify_batch(lines, band_hz, structure), selected
     )
@@ -129,8 +119,8 @@ def identify_batch(
     [[250.0], [251.0]]
     """
     structure = checked_structure(structure)
-    frf = checked_frf(frf)
-    band_hz = checked_band(frf.frequency_hz, band_hz)
+    frf = _checked_frf(frf)
+    band_hz = _checked_band(frf.frequency_hz, band_hz)
     selected = frf.band(*band_hz)
     return _identify(
         selected.frequency_hz,
@@ -202,8 +192,8 @@ def identify_spectra(
     250.00 Hz (1, 2, 2)
     """
     structure = checked_structure(structure)
-    frequency_hz, spectra, covariance = checked_spectra(frequency_hz, spectra, covariance, dof)
-    band_hz = checked_band(frequency_hz, band_hz)
+    frequency_hz, spectra, covariance = _checked_spectra(frequency_hz, spectra, covariance, dof)
+    band_hz = _checked_band(frequency_hz, band_hz)
     inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
     return _identify(
         frequency_hz[inside],
@@ -293,118 +283,100 @@ def _judged(
     return of_fit, judged
 
 
-def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
-    """The poles; status MODEL_ERROR where a transient is left in the FRF they are from, or it has that status.
-
-    Parameters
-    ----------
-    frf : FRF
-        With (F,) arrays.
-    poles : Poles
-        Of it.
-
-    Notes
-    -----
-    What a polynomial leaves of a transient ``c / (s - p)`` on the bins between harmonics counts as
-    noise of the output, and is largest beside the mode. So the variance of the output given the input
-    (``C_YY - |C_YU|^2 / C_UU``, which noise of the generator does not enter) of the lines within half
-    the mode's width, three at least and a quarter of the band at most, is compared with that of the
-    farther half of the band by an F-test. It needs `FRF.sensor_variance_given_actuator`, hence two
-    periods; of one period, realisations show a transient by what they differ by (status MODEL_ERROR of the
-    FRF, see `frf.realisations`). Where none is detected half widths below `FEWEST_BINS` are mentioned.
-
-    Monte Carlo, 30 records a cell of a mode at 250 Hz in 200-300 Hz, lines 2.5 Hz apart, order 2, 2 to 8
-    periods, damping ratio .005 to .1, 20 to 80 dB: from rest, mean square errors of f0 over the
-    Cramer-Rao bound were
-
-    ========  ==========  =======  =======  =======  =======
-    periods   half width  20 dB    40 dB    60 dB    80 dB
-    ========  ==========  =======  =======  =======  =======
-    2         1 bin       2e2      1e4      3e5      9e6
-    2         4 bins      9        3e2      2e3      8e3
-    2         10 bins     1.6      11       65       2e2
-    2         20 bins     1.2      1.2      6        11
-    4         8 bins      1.0      4.5      36       5e2
-    8         4 bins      2.6      44       2e2      1e3
-    8         16 bins     1.0      1.0      3.3      22
-    ========  ==========  =======  =======  =======  =======
-
-    The stated ellipses held the truth in 97 % or more, for what is left raises the variance too: such
-    poles are not wrong, but of next to no precision. Of half widths below a bin that is so with
-    `UNRESOLVED`; without, damping ratios were off by up to 16 deviations. In steady state the ratio was
-    .5 to 2 throughout. The test found every cell with a ratio above 3, and none in steady state.
-    """
-    if frf.status is FrfStatus.MODEL_ERROR:
-        return _doubted(frf, poles)
-    if "local polynomial" not in frf.method or frf.periods < 2 or poles.f0_hz.size == 0:
-        return poles
-    left = max(_beside(frf, poles, k) for k in range(poles.f0_hz.size))
-    if left > 0:
-        note = (
-            f"beside the mode the output's variance is {left:.3g} times that of the other lines: the "
-            "local polynomials do not follow its transient, and the poles have little precision; use "
-            "the joint method, more periods, or drop the first"
+def _checked_frf(frf: FRF) -> FRF:
+    """The FRF with arrays of double precision, its variances in the shape of its response."""
+    require_kind(frf, "frf", FRF)
+    g = _numbers(frf.g, "frf.g", complex)
+    frequency_hz = _checked_lines(frf.frequency_hz, "frf.frequency_hz")
+    if g.shape[-1:] != frequency_hz.shape:
+        raise ValueError(
+            f"frf.g: shape {g.shape}, expected (..., {frequency_hz.size}), one for each line"
         )
-        poles = _doubted(frf, poles)
-    else:
-        note = _light_damping(frf, poles)
-    return poles.noting(note)
+    variances: dict[str, Any] = {}
+    for name, dof_name in (("variance_noise", "noise_dof"), ("variance_total", "total_dof")):
+        variance = variances[name] = getattr(frf, name)
+        if variance is None:
+            continue
+        try:
+            variances[name] = np.broadcast_to(np.asarray(variance, float), g.shape)
+        except ValueError:
+            raise ValueError(
+                f"frf.{name}: shape {np.shape(variance)}, expected that of g, {g.shape}"
+            ) from None
+        _check_dof(getattr(frf, dof_name), f"frf.{dof_name}")
+    return replace(frf, frequency_hz=frequency_hz, g=g, **variances)
 
 
-def _doubted(frf: FRF, poles: Poles) -> Poles:
-    """With status MODEL_ERROR unless it is worse, and what a narrow mode is off by in the total covariance."""
-    judged = poles.status in (PolesStatus.OK, PolesStatus.NO_COVARIANCE)
-    total = poles.covariance if poles.total_covariance is None else poles.total_covariance
-    if total is not None:
-        std = np.where(_half_width(frf, poles) < NARROW, UNRESOLVED * 2 * np.pi * _bin_hz(frf), 0.0)
-        total = total + in_any_direction(std, poles.poles_rad_s)
-    return replace(
-        poles,
-        status=PolesStatus.MODEL_ERROR if judged else poles.status,
-        total_covariance=total,
-    )
+def _checked_spectra(
+    frequency_hz: npt.ArrayLike, spectra: npt.ArrayLike, covariance: npt.ArrayLike, dof: int
+) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+    """Lines (F,), spectra (..., 2, F) and covariance (..., 2, 2, F) of double precision."""
+    lines_hz = _checked_lines(frequency_hz, "frequency_hz")
+    z, c = _numbers(spectra, "spectra", complex), _numbers(covariance, "covariance", complex)
+    lines = lines_hz.size
+    if z.shape[-2:] != (2, lines) or c.shape[-3:] != (2, 2, lines):
+        raise ValueError(
+            f"spectra, covariance: shapes {z.shape}, {c.shape}, "
+            f"expected (..., 2, {lines}) and (..., 2, 2, {lines}), one for each line"
+        )
+    _check_dof(dof, "dof")
+    y, u, yu, uy = (c[..., i, j, :] for i, j in ((0, 0), (1, 1), (0, 1), (1, 0)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        product = np.sqrt(np.abs(y.real)) * np.sqrt(np.abs(u.real))
+        real = np.abs(y.imag) <= ROUNDING * np.abs(y)
+        real &= np.abs(u.imag) <= ROUNDING * np.abs(u)
+        alike = np.abs(yu - uy.conj()) <= ROUNDING * product
+        definite = (y.real >= 0) & (u.real >= 0) & (np.abs(yu) <= (1 + ROUNDING) * product)
+    # lines of NaN are left out later
+    wrong = np.isfinite(c).all(axis=(-3, -2)) & ~(real & alike & definite)
+    if wrong.any():
+        *_, line = np.argwhere(wrong)[0]
+        matrix = c[tuple(np.argwhere(wrong)[0][:-1])][..., line].tolist()
+        raise ValueError(
+            f"covariance: {matrix} at {lines_hz[line]:g} Hz, expected a Hermitian matrix, "
+            "[[E|dY|^2, E dY conj(dU)], [E dU conj(dY), E|dU|^2]], without negative variances"
+        )
+    try:
+        c = np.broadcast_to(c, (*z.shape[:-2], 2, 2, lines))
+    except ValueError:
+        raise ValueError(
+            f"covariance: shape {c.shape}, expected {(*z.shape[:-2], 2, 2, lines)} as spectra"
+        ) from None
+    return lines_hz, z, c
 
 
-def _beside(frf: FRF, poles: Poles, mode: int) -> float:
-    """How much larger the variance beside a mode is than elsewhere; 0 where chance may make it."""
-    band = frf.band(*poles.band_hz)
-    variance = band.sensor_variance_given_actuator
-    if variance is None or band.noise_dof < 2:
-        return 0.0
-    distance = np.abs(band.frequency_hz - poles.f0_hz[mode])
-    order = np.argsort(distance)
-    half_width = abs(poles.damping_ratio[mode]) * poles.f0_hz[mode]
-    near = int(np.clip(np.sum(distance <= half_width), FEWEST_NEAR, max(order.size // 4, 1)))
-    far = order[order.size // 2 :]
-    # neighbouring lines share the bins between them
-    dof = min(band.noise_dof - 1, (band.periods - 1) * band.realisations)
-    mean = float(variance[far].mean()) if far.size else 0.0
-    if not mean > 0:
-        return 0.0
-    ratio = float(variance[order[:near]].mean()) / mean
-    alarm = TRANSIENT_FALSE_ALARM / poles.f0_hz.size
-    return ratio if ratio > special.fdtri(2 * near * dof, 2 * far.size * dof, 1 - alarm) else 0.0
+def _checked_lines(frequency_hz: npt.ArrayLike, name: str) -> FloatArray:
+    """(F,) float, ascending from 0 or above; ``ValueError`` naming the first line that is not."""
+    lines_hz = _numbers(frequency_hz, name, float)
+    if lines_hz.ndim != 1:
+        raise ValueError(f"{name}: shape {lines_hz.shape}, expected (F,)")
+    good = np.isfinite(lines_hz) & (lines_hz >= 0)
+    good[1:] &= lines_hz[1:] > lines_hz[:-1]
+    if not good.all():
+        k = int(np.argmin(good))
+        before = f" after {lines_hz[k - 1]:g}" if k else ""
+        raise ValueError(f"{name}: {lines_hz[k]:g} Hz{before}, expected 0 or above, ascending")
+    return lines_hz
 
 
-def _light_damping(frf: FRF, poles: Poles) -> str:
-    """Where the transient of a mode is too narrow for the local polynomials that removed it."""
-    if frf.frequency_hz.size < 2:
-        return ""
-    half_width = _half_width(frf, poles)
-    if not np.any(half_width < FEWEST_BINS):
-        return ""
-    return (
-        f"half the width of the mode is {half_width.min():.1f} bins, less than {FEWEST_BINS}: "
-        "unless the record began settled, what the local polynomial method leaves of the transient "
-        "biases the poles"
-    )
+def _checked_band(
+    frequency_hz: FloatArray, band_hz: tuple[float, float] | None
+) -> tuple[float, float]:
+    """(low, high): all lines where nothing is asked for."""
+    if band_hz is None:
+        lines_hz = frequency_hz if frequency_hz.size else np.full(1, np.nan)
+        return float(lines_hz[0]), float(lines_hz[-1])
+    return band(band_hz)
 
 
-def _half_width(frf: FRF, poles: Poles) -> FloatArray:
-    """(n,) of the modes, in bins of the record."""
-    return np.asarray(np.abs(poles.damping_ratio) * poles.f0_hz / _bin_hz(frf))
+def _numbers(values: npt.ArrayLike, name: str, kind: type) -> npt.NDArray:
+    """Array of a kind; ``ValueError`` naming the field where the values are no array of numbers."""
+    try:
+        return np.asarray(values, kind)
+    except (TypeError, ValueError):
+        require(False, name, values, "an array of numbers")
+        raise
 
 
-def _bin_hz(frf: FRF) -> float:
-    """One over the duration of the record."""
-    return float(np.diff(frf.frequency_hz).min()) / frf.periods
+def _check_dof(dof: float, name: str) -> None:
+    require(number(dof, name) >= 0, name, dof, "a number of degrees of freedom, 0 or above")

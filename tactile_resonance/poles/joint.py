@@ -24,16 +24,15 @@ import numpy.typing as npt
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.poles.basis import default_transient_terms, transient_basis
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint_fit import fit_records
 from tactile_resonance.poles.judgement import assemble
-from tactile_resonance.poles.plan import FitPlan
+from tactile_resonance.poles.model import PolynomialBasis
 from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.starts import best_of_split
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.poles.tables import Problem
+from tactile_resonance.poles.tables import FitPlan, Problem
 
 METHOD = "joint maximum likelihood of poles and transient"
 
@@ -231,13 +230,29 @@ class JointPlan(FitPlan):
 
     @cached_property
     def transient_on_bins(self) -> ComplexArray:
-        """(K, c) basis of the transient's numerator on all bins."""
-        terms = self.transient_terms
-        if terms is None:
-            terms = default_transient_terms(self.structure)
-        return transient_basis(
-            self.frequency_hz, terms, self.sample_rate_hz, self.band_hz, self.structure
-        )
+        """(K, c) basis of the transient's numerator on all bins.
+
+        Samples of ``exp(p t)`` have the spectrum ``T / (1 - exp((p - s) T))``, aliases of ``1 / (s - p)``
+        included: for n poles a polynomial of order n - 1 in 1/z over ``A(z)``, and ``A(s) / A(z)`` hardly
+        depends on the poles. It is taken at pairs +-j w spread evenly over the band, one for each two poles,
+        and at 0 for a last single one.
+        """
+        interval_s, order = 1 / self.sample_rate_hz, self.structure.order
+        s = 2j * np.pi * self.frequency_hz
+        terms = self.structure.transient_terms if self.transient_terms is None else self.transient_terms
+        basis = PolynomialBasis.on_lines(np.exp(-s * interval_s), terms - 1).values
+        if self.structure.domain == "z":
+            return basis * np.exp(s * interval_s * order)[:, None]
+        pairs = order // 2
+        low, high = self.band_hz
+        w = 2 * np.pi * (low + (high - low) * (np.arange(pairs) + 0.5) / max(pairs, 1))
+        factor = np.ones(s.shape, complex)
+        for pole in (*(1j * w), *(-1j * w), *[0.0] * (order % 2)):
+            step = (s - pole) * interval_s
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = -step / np.expm1(-step)
+            factor *= np.where(np.abs(step) < 1e-12, 1.0, ratio)
+        return basis * factor[:, None]
 
     @cached_property
     def problem(self) -> Problem:
@@ -294,7 +309,7 @@ class PoleEstimator(JointPlan):
     Of one period each there are no bins between harmonics: realisations then measure noise and
     distortion together, and `covariance` holds both. Input noise counts as none, or as
     `input_noise_ratio` of that of the output where given. `total_covariance` holds also what the
-    poles of the realisations scatter by, see `realisations_spread`.
+    poles of the realisations scatter by, see `levels.Spread`.
 
     Harmonics of the period that are not excited carry distortion and are not used. A single
     realisation cannot determine any of this, and is left to `JointPlan`.

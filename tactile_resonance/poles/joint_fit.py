@@ -16,25 +16,26 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.realisations import Agreement
-from tactile_resonance.poles.data import BinData
+from tactile_resonance.poles.data import ROUNDED, TINY, BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import minimise, refit_failed
-from tactile_resonance.poles.joint_noise import TINY, rules_between, with_noise
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
-from tactile_resonance.poles.levels import Level, Levels, line_pieces, smooth_variance
+from tactile_resonance.poles.levels import Levels, Spread, level_of
 from tactile_resonance.poles.likelihood import Solution, moments
-from tactile_resonance.poles.model_error import systematic_of
-from tactile_resonance.poles.noise_level import Pieces, are_flat
-from tactile_resonance.poles.realisations_spread import Spread
+from tactile_resonance.poles.model_error import are_smooth, systematic_of
+from tactile_resonance.poles.noise_level import (
+    Pieces,
+    are_flat,
+    line_pieces,
+    smooth_variance,
+    student_variance,
+)
 from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
-from tactile_resonance.poles.whiteness import are_smooth
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
 
-# Of the power of the data: residuals below are rounding.
-ROUNDED = 1e-22
 # How often the noise of one record is taken anew, and the change of its variance below which it is the same.
 MOST_RETURNS = 4
 SAME_LEVEL = 0.1
@@ -167,12 +168,29 @@ class _Round:
         return moments(self.plan.problem.tables, changed, self.solution.theta)[2][:, :, 1]
 
     def covariances(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Of the shared coefficients, from noise and in total; see `Levels.covariances`."""
-        noise = None
-        if self.share is not None and self.data.undriven:
-            noise = self.normal_of_excited(self.share)
-        shared = sum(self.plan.problem.sizes[:2])
-        return self.levels.covariances(self.solution, shared, suspect, noise)
+        """(batch, s, s) of the coefficients that realisations share, from noise and in total."""
+        solution, levels, shared = self.solution, self.levels, sum(self.plan.problem.sizes[:2])
+        level, dof = levels.residual_level(suspect)
+        between, between_dof = levels.noise_level(suspect)
+        pieces = np.where(levels.piece_dof > 2, levels.piece_dof / (levels.piece_dof - 2), 1.0)
+        first, last = solution.normal[:, :, 0], solution.normal[:, :, 1]
+        noise = solution.marginal[:, 0, :shared, :shared]
+        if np.isnan(levels.between_dof).all():
+            both = 0.5 * (level * student_variance(dof) * pieces)[:, None, None]
+            return both * noise, both * noise
+        if self.share is None:  # there is no less than the noise
+            more = np.maximum(level / between, 1.0)
+        else:
+            between, between_dof = levels.between, levels.between_dof
+            more = level / between
+            noise = solution.sandwich(first + self.normal_of_excited(self.share), shared)
+        total = solution.sandwich(first + last * more[:, None, None, None], shared)
+        scale = 0.5 * between * pieces
+        total_dof = np.where(more == 1, between_dof, dof)
+        return (
+            noise * (scale * student_variance(between_dof))[:, None, None],
+            total * (scale * student_variance(total_dof))[:, None, None],
+        )
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -254,18 +272,20 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     solution, data = fitted.solution, fitted.data
     theta, inverse = solution.theta[:, 0], solution.marginal[:, 0]
     batch = len(theta)
-    level = Level.of(plan, solution, fitted.noise, fitted.kind == 2)
-    residual = solution.residual[:, 0] * (1 / np.sqrt(level.scale))[:, None]
-    suspect = are_smooth(residual, plan.structure.parameters) | level.suspect
+    scale, cost, expected, suspect, noise, correction = level_of(
+        plan, solution, fitted.noise, fitted.kind == 2
+    )
+    residual = solution.residual[:, 0] * (1 / np.sqrt(scale))[:, None]
+    suspect = are_smooth(residual, plan.structure.parameters) | suspect
     asked = _may_return(solution)
     if batch > 1:
-        asked &= suspect | asks(plan, level.cost, level.expected, residual)
+        asked &= suspect | asks(plan, cost, expected, residual)
     lack = Lack.of(plan, data, solution, asked)
     suspect = suspect | np.isfinite(lack.found[:, 0])
     doubted = suspect | (lack.chi_square > 0)
     if doubted.any():  # what rounding leaves of exact data says nothing
         rows = np.flatnonzero(doubted)
-        of_noise = (level.scale * data.variance_y.min(axis=1))[rows]
+        of_noise = (scale * data.variance_y.min(axis=1))[rows]
         doubted[rows] = of_noise > ROUNDED * _mean_power(data.rows(rows))
         suspect &= doubted
         lack.found[~suspect] = np.nan
@@ -273,7 +293,7 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     # others are fitted once more
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
-    covariance = inverse * (0.5 * level.scale * level.correction)[:, None, None]
+    covariance = inverse * (0.5 * scale * correction)[:, None, None]
     known = plan.level_known
     return Judged.of(
         plan,
@@ -282,14 +302,14 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         condition_number=solution.condition,
         converged=solution.converged,
         residual=residual,
-        cost=level.cost,
-        expected_cost=level.expected,
+        cost=cost,
+        expected_cost=expected,
         suspect=suspect,
         covariance=covariance if known else np.full_like(covariance, np.nan),
         total=None if known else covariance,
         kind=fitted.kind,
         level_known=np.full(batch, known),
-        noise_variance=level.noise,
+        noise_variance=noise,
         systematic=systematic_of(plan, data, solution.theta, wrong),
         lacking=lack.found,
         doubt=lack.doubt,

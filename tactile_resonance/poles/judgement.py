@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.model_error import model_error_factor
+from tactile_resonance.poles.model_error import SMOOTH_RESIDUAL, model_error_factor
 from tactile_resonance.poles.modes import (
     beside_others,
     fall_of_noise,
@@ -22,9 +22,8 @@ from tactile_resonance.poles.modes import (
     significant_modes,
 )
 from tactile_resonance.poles.noise_level import KINDS
-from tactile_resonance.poles.plan import FitPlan
 from tactile_resonance.poles.result import STATUS_CODE, Poles, PolesBatch, PolesStatus
-from tactile_resonance.poles.whiteness import SMOOTH_RESIDUAL
+from tactile_resonance.poles.tables import FitPlan
 
 Plan = TypeVar("Plan", bound=FitPlan)
 

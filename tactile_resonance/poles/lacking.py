@@ -22,15 +22,15 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
-from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.likelihood import Solution
-from tactile_resonance.poles.whiteness import are_smooth
+from tactile_resonance.poles.model import PolynomialBasis
+from tactile_resonance.poles.model_error import are_smooth
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
-    from tactile_resonance.poles.plan import FitPlan
+    from tactile_resonance.poles.tables import FitPlan
 
 
 # How often each of the two tests finds something lacking in a model that is complete.

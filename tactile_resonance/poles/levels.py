@@ -1,33 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Levels of noise and distortion that a fit to records shows, and whether its cost contradicts the model.
+"""Levels of noise and distortion that a fit to records shows, and whether records contradict the model.
 
 An error of the model is an error of the response: turned by the phase of the input it is the same in
 every realisation. Noise and stochastic nonlinear distortion differ (Pintelon & Schoukens, *System
 Identification: A Frequency Domain Approach*, 2nd ed. (2012), section 4.3). So of M residuals on a
 line one combination may hold model error, and the M - 1 others give the variance.
+
+A nonlinear resonator is another system in each realisation. Its departures are not independent from line to
+line, so what lines scatter by says too little of them; what the poles of each realisation alone scatter by
+does. That scatter has few degrees of freedom: ellipses are widened by the quantile of Student's distribution
+that belongs to them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.joint_noise import BINS_PER_BAND
-from tactile_resonance.poles.likelihood import Solution, invert
+from tactile_resonance.poles.data import BINS_PER_BAND, BinData
+from tactile_resonance.poles.likelihood import Solution, invert, moments
+from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.noise_level import (
     Pieces,
     is_rare,
-    log_linear,
-    model_variance,
     moments_of_ratio,
     student_variance,
-    two_channels,
 )
+from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
@@ -35,112 +40,65 @@ if TYPE_CHECKING:
 
 # Noise alone looks like distortion this often; it is then weighted as such, at next to no loss.
 DISTORTION_PROBABILITY = 1e-2
-# Degrees of freedom that a variance known from a piece of the band alone should have, and the fewest.
-PIECE_DOF = 24
-FEWEST_PIECE_DOF = 8
-# Pieces that are wanted before their degrees of freedom are.
-WANTED_PIECES = 5
+# Scatter that chance makes more often says nothing; the rarer it is, the more it counts. A test that is
+# passed or not would pass differences of the size of the noise, and ellipses would hold 80 to 90 %.
+CHANCE = 0.5
+# Fewer cannot show whether one is off, or all differ.
+FEWEST_RECORDS = 4
+# Share of errors (f0, damping) within the ellipse.
+INSIDE = 0.95
 
 
-@dataclass(frozen=True, eq=False)
-class Level:
-    """Noise level of points of one record, in units of the variances weighted with.
+def level_of(
+    plan: JointPlan, solution: Solution, noise: FloatArray, by_piece: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:
+    """Noise level that a fit of points of one record each shows, and whether it contradicts the model.
 
-    Attributes
+    Without bins between harmonics it is from the residuals, and a model error hides in it unless they
+    are smooth. With such bins these give the level, and the excited ones whether the model holds.
+
+    Parameters
     ----------
+    plan : JointPlan
+    solution : Solution
+    noise : (batch, 2) float
+        Mean variances of Y and U weighted with.
+    by_piece : (batch,) bool
+        Where the variances are from each of the pieces of the band alone.
+
+    Returns
+    -------
     scale : (batch,) float
-        Level that covariances are of.
+        Level that covariances are of, in units of the variances weighted with.
     cost, expected, suspect, noise
         See `judgement.Judged`.
     correction : (batch,) float
         Factor of the covariance for a level that is not known exactly.
     """
-
-    scale: FloatArray
-    cost: FloatArray
-    expected: FloatArray
-    suspect: BoolArray
-    noise: FloatArray
-    correction: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        plan: JointPlan,
-        solution: Solution,
-        noise: FloatArray,
-        by_piece: BoolArray,
-    ) -> Level:
-        """Level of a fit.
-
-        Without bins between harmonics it is from the residuals, and a model error hides in it unless they
-        are smooth. With such bins these give the level, and the excited ones whether the model holds.
-
-        Parameters
-        ----------
-        plan : JointPlan
-        solution : Solution
-        noise : (batch, 2) float
-            Mean variances of Y and U weighted with.
-        by_piece : (batch,) bool
-            Where the variances are from each of the pieces of the band alone.
-        """
-        batch, _, n = solution.theta.shape
-        lines, others = plan.excited_at.size, plan.others_at.size
-        if others == 0:
-            dof = np.full(batch, max(lines - n / 2, 0.5))
-            scale, nothing = solution.cost / dof, np.full(batch, np.nan)
-            no = np.zeros(batch, bool)
-            return cls(scale, nothing, nothing, no, noise * scale[:, None], student_variance(dof))
-        used = solution.leverage[:, 0]
-        dof_o = others - used / 2
-        dof_e = lines - (n - used) / 2
-        dof = dof_e + dof_o
-        level = solution.part_cost[:, 0] / dof_o
-        cost = solution.part_cost[:, 1] / level
-        expected = dof_e * dof_o / (dof_o - 1)
-        suspect = is_rare(cost / dof_e, dof_e, dof_o, MODEL_ERROR_PROBABILITY)
-        correction = student_variance(dof)
-        if by_piece.any():
-            mean, std = moments_of_ratio(BINS_PER_BAND)  # weights are from few bins
-            limit = dof_e * mean - np.sqrt(dof_e) * std * special.ndtri(MODEL_ERROR_PROBABILITY)
-            expected = np.where(by_piece, expected * mean, expected)
-            suspect = np.where(by_piece, cost > limit, suspect)
-            correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
-        scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
-        return cls(scale, cost, expected, suspect, noise * level[:, None], correction)
-
-
-def line_pieces(lines: int, dof: int) -> Pieces:
-    """Pieces of lines with a sample variance of `dof` degrees of freedom each."""
-    size = min(-(-PIECE_DOF // dof), max(1, lines // WANTED_PIECES))
-    return Pieces.of(lines, max(size, -(-FEWEST_PIECE_DOF // dof)), dof)
-
-
-def smooth_variance(
-    sample: FloatArray, gain: FloatArray, pieces: Pieces
-) -> tuple[FloatArray, IntArray]:
-    """Variance on each line from sample variances, and its kind as index into `KINDS`.
-
-    Flat on both channels unless a test says otherwise, then sloped, then piece by piece.
-
-    Parameters
-    ----------
-    sample : (batch, K) float
-    gain : (batch, K) float
-        ``|G|^2``.
-    pieces : Pieces
-    """
-    kind = model_variance(pieces.means(sample), pieces.dof, pieces.means(gain)).kind
-    variance = two_channels(sample, gain)
-    sloped, each = kind == 1, kind == 2
-    if sloped.any():  # with noise of both channels, whose sum follows the resonance
-        curve = log_linear(sample[sloped])
-        more = two_channels(sample[sloped] / curve, gain[sloped])
-        variance[sloped] = curve * more
-    if each.any():
-        variance[each] = pieces.means(sample[each])[:, pieces.of_bin]
-    return variance, kind
+    batch, _, n = solution.theta.shape
+    lines, others = plan.excited_at.size, plan.others_at.size
+    if others == 0:
+        dof = np.full(batch, max(lines - n / 2, 0.5))
+        scale, nothing = solution.cost / dof, np.full(batch, np.nan)
+        no = np.zeros(batch, bool)
+        return scale, nothing, nothing, no, noise * scale[:, None], student_variance(dof)
+    used = solution.leverage[:, 0]
+    dof_o = others - used / 2
+    dof_e = lines - (n - used) / 2
+    dof = dof_e + dof_o
+    level = solution.part_cost[:, 0] / dof_o
+    cost = solution.part_cost[:, 1] / level
+    expected = dof_e * dof_o / (dof_o - 1)
+    suspect = is_rare(cost / dof_e, dof_e, dof_o, MODEL_ERROR_PROBABILITY)
+    correction = student_variance(dof)
+    if by_piece.any():
+        mean, std = moments_of_ratio(BINS_PER_BAND)  # weights are from few bins
+        limit = dof_e * mean - np.sqrt(dof_e) * std * special.ndtri(MODEL_ERROR_PROBABILITY)
+        expected = np.where(by_piece, expected * mean, expected)
+        suspect = np.where(by_piece, cost > limit, suspect)
+        correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
+    scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
+    return scale, cost, expected, suspect, noise * level[:, None], correction
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +219,7 @@ class Levels:
         chance = special.fdtrc(2 * self.excited_dof, 2 * self.between_dof, self.excited / self.between)
         return np.asarray(chance < DISTORTION_PROBABILITY)
 
-    def _residual_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def residual_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(batch,) level of the excited lines and its degrees of freedom.
 
         With what realisations have in common, where that is no model error.
@@ -274,53 +232,13 @@ class Levels:
 
     def noise_level(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(batch,) of the noise, and its dof; without bins between harmonics of noise and distortion."""
-        level, dof = self._residual_level(suspect)
+        level, dof = self.residual_level(suspect)
         if np.isnan(self.between_dof).all():
             return level, dof
         both = self.between_dof + dof
         pooled = (self.between * self.between_dof + level * dof) / both
         apart = self.distorted()
         return np.where(apart, self.between, pooled), np.where(apart, self.between_dof, both)
-
-    def covariances(
-        self, solution: Solution, shared: int, suspect: BoolArray, noise_normal: FloatArray | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Covariances (batch, s, s) of the shared coefficients, from noise and in total.
-
-        Parameters
-        ----------
-        solution : Solution
-        shared : int
-            How many coefficients realisations share.
-        suspect : (batch,) bool
-            Where the model is in error.
-        noise_normal : (batch, M, n, n) float or None
-            Covariance of the gradient on excited lines from their noise alone; None where that is
-            all they were weighted with.
-        """
-        level, dof = self._residual_level(suspect)
-        between, between_dof = self.noise_level(suspect)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            nu = self.piece_dof
-            pieces = np.where(nu > 2, nu / (nu - 2), 1.0)
-            first, last = solution.normal[:, :, 0], solution.normal[:, :, 1]
-            noise = solution.marginal[:, 0, :shared, :shared]
-            if np.isnan(self.between_dof).all():
-                both = 0.5 * (level * student_variance(dof) * pieces)[:, None, None]
-                return both * noise, both * noise
-            if noise_normal is not None:
-                between, between_dof = self.between, self.between_dof
-                noise = solution.sandwich(first + noise_normal, shared)
-            more = level / between
-            if noise_normal is None:  # there is no less than the noise
-                more = np.maximum(more, 1.0)
-            total = solution.sandwich(first + last * more[:, None, None, None], shared)
-            scale = 0.5 * between * pieces
-            total_dof = np.where(more == 1, between_dof, dof)
-            return (
-                noise * (scale * student_variance(between_dof))[:, None, None],
-                total * (scale * student_variance(total_dof))[:, None, None],
-            )
 
 
 def _taken_by_transients(plan: JointPlan, solution: Solution, variance: FloatArray) -> FloatArray:
@@ -338,3 +256,171 @@ def _taken_by_transients(plan: JointPlan, solution: Solution, variance: FloatArr
     return (inverse.reshape(-1, own * own) @ products.T) / (
         variance * (size.real**2 + size.imag**2)
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Departures of each realisation, one step from what all share.
+
+    Attributes
+    ----------
+    step : (batch, s) float
+        Mean departure of the shared coefficients.
+    departure : (batch, M, places, 2) float
+        Of (f0_hz, damping_ratio); NaN where there is no mode.
+    expected : (batch, M, places, 2) float
+        Its variance, if lines scattered independently.
+    dof : (batch,) float
+        Real degrees of freedom of what that rests on.
+    turn : (batch, places, 2, a) float
+        Derivative of (f0_hz, damping_ratio) by the coefficients of A.
+    """
+
+    step: FloatArray
+    departure: FloatArray
+    expected: FloatArray
+    dof: FloatArray
+    turn: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        plan: JointPlan,
+        data: BinData,
+        theta: FloatArray,
+        inner: FloatArray,
+        dof: FloatArray,
+    ) -> Spread:
+        """Departures from a fit.
+
+        Parameters
+        ----------
+        plan : JointPlan
+        data : BinData
+            With the variances that it was weighted with.
+        theta : (batch, M, n) float
+            The fit.
+        inner : (batch, M, n, n) float
+            Covariance of the gradient of each realisation, twice, if lines scattered independently.
+        dof : (batch,) float
+            Complex degrees of freedom of that.
+        """
+        a, b, _ = plan.problem.sizes
+        batch, records, n = theta.shape
+        _, gradient, normal = moments(plan.problem.tables, data, theta)
+        inverse = invert(normal.sum(axis=2).reshape(-1, n, n))[0]
+        step = -(inverse @ gradient.reshape(-1, n, 1))[:, : a + b, 0]
+        inverse = inverse[:, :a]  # (batch M, a, n)
+        covariance = 0.5 * inverse @ inner.reshape(-1, n, n) @ inverse.swapaxes(-1, -2)
+        step = step.reshape(batch, records, a + b)
+        covariance = covariance.reshape(batch, records, a, a)
+        poles = plan.poles_in_band(theta[:, 0])
+        _, sensitivity = plan.model_of(theta[:, 0]).residues_and_sensitivity(poles)  # (batch, places, a)
+        turn = natural_frequency_and_damping_jacobian(poles) @ real_rows(sensitivity)
+        departure = np.einsum("bpia,bma->bmpi", turn, step[..., :a])
+        expected = np.einsum("bpia,bmac,bpic->bmpi", turn, covariance, turn)
+        return cls(step.mean(axis=1), departure, expected, 2 * dof, turn)
+
+    @property
+    def records(self) -> int:
+        """M."""
+        return self.departure.shape[1]
+
+    @property
+    def information(self) -> FloatArray:
+        """(batch, M, places, 2) share of each realisation in the information of all."""
+        information = 1 / self.expected
+        return np.asarray(information / information.sum(axis=1, keepdims=True))
+
+    @property
+    def ratio(self) -> FloatArray:
+        """(batch, places, 2) scatter over what independent lines explain."""
+        rest = self._rest(self.information)
+        return np.asarray(np.sum(rest**2 / self.expected, axis=1) / (self.records - 1))
+
+    @property
+    def known(self) -> BoolArray:
+        """(batch,) whether each realisation alone determines a pole."""
+        return np.asarray(np.isfinite(self.ratio).any(axis=(1, 2)))
+
+    @property
+    def chance(self) -> FloatArray:
+        """(batch,) how often one system scatters as much, in f0 or damping of any mode; NaN: not known."""
+        p = special.fdtrc(self.records - 1, self.dof[:, None, None], self.ratio)
+        p = np.where(np.isfinite(p), p, np.inf).min(axis=(1, 2), initial=np.inf)
+        known = self.known & np.isfinite(p)
+        return np.where(known, 1 - (1 - np.where(known, p, 1.0)) ** (2 * self.ratio.shape[1]), np.nan)
+
+    @property
+    def weight(self) -> FloatArray:
+        """(batch,) from 0, where chance explains the scatter, to 1."""
+        return np.nan_to_num(np.clip(1 - self.chance / CHANCE, 0.0, 1.0))
+
+    def variance_of_mean(self, alike: BoolArray) -> FloatArray:
+        """(batch, places, 2) of (f0_hz, damping_ratio), for an ellipse as of many degrees of freedom.
+
+        Widened so that it holds both errors in 95 %, also where they are fully correlated:
+        ``2 t^2 / chi^2`` of M - 1 and of two degrees of freedom.
+
+        Parameters
+        ----------
+        alike : (batch,) bool
+            Whether realisations count alike in the mean, not by their information.
+        """
+        share = np.where(alike[:, None, None, None], 1 / self.records, self.information)
+        of_mean = np.sum((share * self._rest(share)) ** 2, axis=1)
+        quantile = special.stdtrit(self.records - 1, (1 + INSIDE) / 2)
+        wider = 2 * quantile**2 / special.chdtri(2, 1 - INSIDE)
+        return np.asarray(wider * self.records / (self.records - 1) * of_mean)
+
+    def of_poles(self, covariance: FloatArray) -> FloatArray:
+        """(batch, places, 2) variances of (f0_hz, damping_ratio) from a covariance (batch, s, s)."""
+        a = self.turn.shape[-1]
+        return np.asarray(
+            np.einsum("bpia,bac,bpic->bpi", self.turn, covariance[:, :a, :a], self.turn)
+        )
+
+    def remarks(self) -> tuple[BoolArray, npt.NDArray[np.object_]]:
+        """(batch,) where one realisation contradicts the others, and a note for people."""
+        surely = self.chance < MODEL_ERROR_PROBABILITY
+        if not surely.any():
+            return surely, np.full(surely.size, "", object)
+        odd, away = self._odd_one()
+        size = np.sqrt(np.nan_to_num(self.ratio).max(axis=(1, 2), initial=0.0))
+        remarks = np.full(size.size, "", object)
+        for k in np.flatnonzero(surely):
+            remarks[k] = (
+                f"poles of {self.records} realisations scatter {size[k]:.1f} times as much as noise and "
+                "distortion of independent lines make them: each is another system"
+            )
+            if odd[k] >= 0:
+                remarks[k] = (
+                    f"realisation {odd[k] + 1} departs from the other {self.records - 1}, which agree, by "
+                    f"{away[k]:.1f} deviations"
+                )
+        return surely & (odd >= 0), remarks
+
+    def _rest(self, share: FloatArray) -> FloatArray:
+        """(batch, M, places, 2) departures from their mean."""
+        mean = np.sum(share * self.departure, axis=1, keepdims=True)
+        return np.asarray(self.departure - mean)
+
+    def _odd_one(self) -> tuple[IntArray, FloatArray]:
+        """(batch,) the realisation that departs from all others, which agree, or -1; by how many deviations."""
+        batch, records = self.departure.shape[:2]
+        odd, size = np.full(batch, -1), np.zeros(batch)
+        if records < FEWEST_RECORDS:
+            return odd, size
+        limit = -special.ndtri(MODEL_ERROR_PROBABILITY / (4 * records))
+        for m in range(records):
+            rest = np.arange(records) != m
+            others = replace(
+                self, departure=self.departure[:, rest], expected=self.expected[:, rest]
+            )
+            mean = np.sum(others.information * others.departure, axis=1)
+            spread = self.expected[:, m] + 1 / np.sum(1 / others.expected, axis=1)
+            away = np.abs(self.departure[:, m] - mean) / np.sqrt(spread)
+            away = np.nan_to_num(away).max(axis=(1, 2), initial=0.0)
+            here = (away > limit) & (away > size) & (others.weight == 0)
+            odd[here], size[here] = m, away[here]
+        return odd, size

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The identified transfer function: poles, zeros, residues, response, and their derivatives."""
+"""The identified transfer function: poles, zeros, residues, response, and their derivatives.
+
+Its polynomials have real coefficients over bases that are orthonormal on the lines of the band: powers of s
+over a narrow band are all but parallel; a basis orthonormal on the data makes the same polynomials well
+conditioned (Forsythe 1957; Brubeck, Nakatsukasa, Trefethen, *Vandermonde with Arnoldi*, SIAM Review 63 (2021)
+405-415). The inner product is the real part, so that coefficients stay real.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +16,120 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray
-from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.compiled import entry
 from tactile_resonance.poles.structure import ModelStructure
+
+
+@dataclass(frozen=True)
+class PolynomialBasis:
+    """Polynomials p_0 .. p_n with ``x p_k = sum_j hessenberg[j, k] p_j``.
+
+    Attributes
+    ----------
+    values : (F, n + 1) complex
+        On the lines.
+    hessenberg : (n + 1, n) float
+    """
+
+    values: ComplexArray
+    hessenberg: FloatArray
+
+    @classmethod
+    def on_lines(
+        cls, x: ComplexArray, degree: int, weight: FloatArray | None = None
+    ) -> PolynomialBasis:
+        """Basis up to `degree` on the points `x` (F,).
+
+        Orthonormal in the mean of ``weight |p_k|^2``, with weights (F,) of mean 1 (all 1 when
+        absent). A degree that the points cannot distinguish from lower ones has values of no meaning but
+        finite ones.
+        """
+        w = np.ones(x.size) if weight is None else weight
+        values = np.zeros((x.size, degree + 1), complex)
+        hessenberg = np.zeros((degree + 1, degree))
+        values[:, 0] = 1.0
+        for k in range(degree):
+            new = x * values[:, k]
+            for _ in range(2):  # twice is enough: the second pass removes what rounding left
+                projection = np.real(values[:, : k + 1].conj().T @ (w * new)) / x.size
+                new = new - values[:, : k + 1] @ projection
+                hessenberg[: k + 1, k] += projection
+            norm = np.sqrt(np.mean(w * np.abs(new) ** 2))
+            hessenberg[k + 1, k] = norm if norm > 0 else 1.0
+            values[:, k + 1] = new / hessenberg[k + 1, k]
+        return cls(values, hessenberg)
+
+    def at(self, x: ComplexArray, derivatives: int = 1) -> ComplexArray:
+        """Values and derivatives at other points.
+
+        Parameters
+        ----------
+        x : (...,) complex
+        derivatives : int
+
+        Returns
+        -------
+        (1 + derivatives, ..., n + 1) complex
+            Values, first derivatives, and so on.
+        """
+        degree = self.hessenberg.shape[1]
+        out = np.zeros((1 + derivatives, *np.shape(x), degree + 1), complex)
+        out[0, ..., 0] = 1.0
+        for k in range(degree):
+            new = x * out[..., k] - out[..., : k + 1] @ self.hessenberg[: k + 1, k]
+            for order in range(1, 1 + derivatives):
+                new[order] += order * out[order - 1, ..., k]
+            out[..., k + 1] = new / self.hessenberg[k + 1, k]
+        return out
+
+    def roots(self, coefficients: FloatArray) -> ComplexArray:
+        """Roots of ``sum_k coefficients[k] p_k``, by the eigenvalues of its comrade matrix.
+
+        Parameters
+        ----------
+        coefficients : (..., m + 1) float
+            With m from 1 to the basis' degree, and a last coefficient other than zero.
+
+        Returns
+        -------
+        (..., m) complex
+            NaN where a coefficient is not finite.
+        """
+        m = coefficients.shape[-1] - 1
+        h = self.hessenberg[:m, :m]
+        if m == 2:  # an eigenvalue solver costs more than the fit
+            return _two_roots(coefficients.reshape(-1, 3), self.hessenberg).reshape(*coefficients.shape[:-1], 2)
+        last = self.hessenberg[m, m - 1] * coefficients[..., :m] / coefficients[..., m:]
+        comrade = np.broadcast_to(h, (*last.shape[:-1], m, m)).copy()
+        comrade[..., :, -1] -= last
+        finite = np.isfinite(last).all(axis=-1) & np.isfinite(h).all()
+        comrade[~finite] = 0.0
+        roots = np.linalg.eigvals(comrade).astype(complex)
+        roots[~finite] = np.nan
+        return roots
+
+
+@entry
+def _two_roots(coefficients, h):
+    """(points, 2) roots of (points, 3) coefficients; see `PolynomialBasis.roots`.
+
+    In closed form; of complex ones that above the real axis comes first.
+    """
+    roots = np.empty((coefficients.shape[0], 2), np.complex128)
+    for point in range(coefficients.shape[0]):
+        scale = h[2, 1] / coefficients[point, 2]
+        first, second = h[0, 0], h[1, 1] - scale * coefficients[point, 1]
+        beside = h[0, 1] - scale * coefficients[point, 0]
+        half, under = (first + second) / 2, ((first - second) / 2) ** 2 + beside * h[1, 0]
+        if under < 0:
+            root = np.sqrt(-under)
+            roots[point, 0], roots[point, 1] = complex(half, root), complex(half, -root)
+        else:
+            # the root of larger modulus first, the other from the product: no cancellation
+            large = half - np.sqrt(under) if half < 0 else half + np.sqrt(under)
+            roots[point, 0] = large
+            roots[point, 1] = 0.0 if large == 0 else (first * second - beside * h[1, 0]) / large
+    return roots
 
 
 @dataclass(frozen=True, eq=False)

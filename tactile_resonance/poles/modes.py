@@ -57,29 +57,6 @@ def _in_band(poles, low_hz, high_hz):
 
 
 @entry
-def two_roots(coefficients, h):
-    """(points, 2) roots of (points, 3) coefficients; see `PolynomialBasis.roots`.
-
-    In closed form; of complex ones that above the real axis comes first.
-    """
-    roots = np.empty((coefficients.shape[0], 2), np.complex128)
-    for point in range(coefficients.shape[0]):
-        scale = h[2, 1] / coefficients[point, 2]
-        first, second = h[0, 0], h[1, 1] - scale * coefficients[point, 1]
-        beside = h[0, 1] - scale * coefficients[point, 0]
-        half, under = (first + second) / 2, ((first - second) / 2) ** 2 + beside * h[1, 0]
-        if under < 0:
-            root = np.sqrt(-under)
-            roots[point, 0], roots[point, 1] = complex(half, root), complex(half, -root)
-        else:
-            # the root of larger modulus first, the other from the product: no cancellation
-            large = half - np.sqrt(under) if half < 0 else half + np.sqrt(under)
-            roots[point, 0] = large
-            roots[point, 1] = 0.0 if large == 0 else (first * second - beside * h[1, 0]) / large
-    return roots
-
-
-@entry
 def propagated(poles, sensitivity, parameters):
     """Covariances (points, k, 2, 2) of (Re, Im) of poles (points, k), and of (f0_hz, damping_ratio).
 

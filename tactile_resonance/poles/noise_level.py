@@ -22,6 +22,11 @@ FALSE_ALARM = 1e-4
 REWEIGHTINGS = 3
 # Of the mean over the band: below it a fitted variance is taken for an accident.
 LEAST_VARIANCE = 1e-3
+# Degrees of freedom that a variance known from a piece of the band alone should have, and the fewest.
+PIECE_DOF = 24
+FEWEST_PIECE_DOF = 8
+# Pieces that are wanted before their degrees of freedom are.
+WANTED_PIECES = 5
 TINY = float(np.finfo(float).tiny)
 KINDS = ("flat", "sloped", "per line")
 
@@ -324,6 +329,37 @@ def log_linear(variance):
         _fit_slope(variance[point], usable, model[point])
     return model
 
+
+def line_pieces(lines: int, dof: int) -> Pieces:
+    """Pieces of lines with a sample variance of `dof` degrees of freedom each."""
+    size = min(-(-PIECE_DOF // dof), max(1, lines // WANTED_PIECES))
+    return Pieces.of(lines, max(size, -(-FEWEST_PIECE_DOF // dof)), dof)
+
+
+def smooth_variance(
+    sample: FloatArray, gain: FloatArray, pieces: Pieces
+) -> tuple[FloatArray, IntArray]:
+    """Variance on each line from sample variances, and its kind as index into `KINDS`.
+
+    Flat on both channels unless a test says otherwise, then sloped, then piece by piece.
+
+    Parameters
+    ----------
+    sample : (batch, K) float
+    gain : (batch, K) float
+        ``|G|^2``.
+    pieces : Pieces
+    """
+    kind = model_variance(pieces.means(sample), pieces.dof, pieces.means(gain)).kind
+    variance = two_channels(sample, gain)
+    sloped, each = kind == 1, kind == 2
+    if sloped.any():  # with noise of both channels, whose sum follows the resonance
+        curve = log_linear(sample[sloped])
+        more = two_channels(sample[sloped] / curve, gain[sloped])
+        variance[sloped] = curve * more
+    if each.any():
+        variance[each] = pieces.means(sample[each])[:, pieces.of_bin]
+    return variance, kind
 
 
 def are_flat(variance: FloatArray, dof: int) -> BoolArray:

@@ -114,7 +114,7 @@ class Poles:
         the variance is unknown.
     whiteness : float
         How much smoother the residuals are than those of noise, as a normal score: see
-        `whiteness.whiteness`. NaN where it was not computed.
+        `model_error.whiteness`. NaN where it was not computed.
     condition_number : float
         Of the column-scaled Jacobian, to within a factor of the number of parameters; NaN where
         there is none.
@@ -297,8 +297,8 @@ class PolesBatch:
 
     @property
     def whiteness(self) -> FloatArray:
-        """(...) how much smoother the residuals are than white ones; see `whiteness.whiteness`."""
-        from tactile_resonance.poles.whiteness import whiteness  # compiled, too
+        """(...) how much smoother the residuals are than white ones; see `model_error.whiteness`."""
+        from tactile_resonance.poles.model_error import whiteness  # compiled, too
 
         return whiteness(self.residual, self.structure.parameters)
 

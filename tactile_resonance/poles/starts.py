@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
-from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     DenseSolution,
@@ -33,11 +32,12 @@ from tactile_resonance.poles.fit import (
 )
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
 from tactile_resonance.poles.likelihood import Solution
+from tactile_resonance.poles.model import PolynomialBasis
 from tactile_resonance.poles.modes import fall_of_noise
-from tactile_resonance.poles.plan import FitPlan
 
 if TYPE_CHECKING:
-    from tactile_resonance.poles.lines_fit import LinesPlan
+    from tactile_resonance.poles.lines import LinesPlan
+    from tactile_resonance.poles.tables import FitPlan
 
 SEVERAL_MODES = 4
 """Order from which on a model has more than one mode."""

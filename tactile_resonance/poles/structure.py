@@ -76,6 +76,17 @@ class ModelStructure:
         """Lines for more real equations than parameters."""
         return self.parameters // 2 + 1
 
+    @property
+    def transient_terms(self) -> int:
+        """Length of the transient's numerator that suits the structure.
+
+        A transient of the model's own poles alone has `order` terms; every residual term beyond the constant
+        stands for modes outside the band, whose transients are as smooth as their responses. Several modes
+        have two more at least, for they need not lie where `joint` takes them.
+        """
+        residual = min(self.numerator_order - self.order, 4)
+        return self.order + max(residual, 2 if self.order > 2 else 0)
+
 
 @dataclass(frozen=True)
 class PoleBand:

@@ -3,7 +3,7 @@
 
 A tone is a sinusoid that the excitation did not make. On an excited line it looks like response and
 bends the poles, between lines it looks like noise. One at a time, the bin that departs most from the
-fit is tested (`outliers`).
+fit is tested (`disturbances`).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.outliers import (
+from tactile_resonance.poles.disturbances import (
     FALSE_ALARM,
     MOST_TONES,
     chances_of,
     falls_without_each,
 )
+from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.tones import ROUNDING, Tone
 

@@ -25,7 +25,6 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.poles.basis import default_transient_terms
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.tones import MAINS_HZ
 
@@ -68,7 +67,7 @@ def lines_wanted(band: PoleBand) -> int:
     noise is estimated.
     """
     structure = ModelStructure.with_residual(band.order or 2, band.residual_terms)
-    coefficients = structure.parameters + default_transient_terms(structure)
+    coefficients = structure.parameters + structure.transient_terms
     return math.ceil(coefficients / 2) + FREE_LINES
 
 

@@ -22,7 +22,7 @@ from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
 from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.lacking import DOUBT, FALSE_ALARM, Lack
-from tactile_resonance.poles.lines_fit import LinesPlan
+from tactile_resonance.poles.lines import LinesPlan
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 

@@ -7,11 +7,11 @@ import pytest
 from scipy import stats
 
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
-from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Linearised, least_squares, minimise, refit_failed
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.likelihood import Rules, invert, moments
+from tactile_resonance.poles.model import PolynomialBasis
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import Problem

@@ -10,9 +10,9 @@ from poles.mode_at_250_hz import BARE, LINES_HZ, W0, G, circular, frf
 from scipy import stats
 
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.poles.basis import PolynomialBasis
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.model import PolynomialBasis
 from tactile_resonance.poles.structure import ModelStructure
 
 

@@ -177,7 +177,7 @@ def test_gives_up_between_the_classes_only_where_no_block_left_would_help():
 
 @pytest.mark.parametrize("distance", [2.0, 3.5])
 def test_errors_are_as_allowed_with_a_covariance_of_few_lines(distance):
-    """Of a level that twelve complex degrees of freedom a block tell, as `levels.Level` states it."""
+    """Of a level that twelve complex degrees of freedom a block tell, as `levels.level_of` states it."""
     rng, runs, dof = np.random.default_rng(8), 1500, 12
     wanted = Separate(*point_classes(distance), probability=0.99)
     limits, factor, wrong = BlockLimits(1, 200), np.linalg.cholesky(BLOCK), 0
