@@ -14,8 +14,15 @@ from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.fields import counted
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.decision import Precise, Separate
-from tactile_resonance.scan.measurement import CALIBRATED_S, MeasurementDesign, design_measurement
-from tactile_resonance.scan.period import LEAST_DISTANCE, lines_wanted, mains_distances, mains_in
+from tactile_resonance.scan.measurement import (
+    CALIBRATED_S,
+    LEAST_DISTANCE,
+    MeasurementDesign,
+    design_measurement,
+    lines_wanted,
+    mains_distances,
+    mains_in,
+)
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.references import SILENT

@@ -7,6 +7,7 @@ bench reads (`tactile_resonance.simulation.tissue.scene`) and a scan does not ne
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
@@ -32,7 +33,6 @@ from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, PoleBand
 from tactile_resonance.scan.adaptive import Adaptive, read_adaptive
 from tactile_resonance.scan.clearance import is_plane
 from tactile_resonance.scan.decision import BlockLimits, Gate, Precise, Separate
-from tactile_resonance.scan.period import residual_terms_of
 from tactile_resonance.scan.points import flat, read_positions, require_near
 from tactile_resonance.scan.surface import NormalRequest, Plane, Surface, TouchRequest, read_surface
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
@@ -45,10 +45,12 @@ from tactile_resonance.tissue.references import parse_classes, parse_nominal_con
 BENCH_KEYS = {"regions", "buried", "motion"}
 AUTO = "auto"
 """What the plan chooses."""
-
-
 MOST_FORCE_N = 1.0
 """A hundred times the preload of the method: beyond it a figure is a slip of the unit."""
+NEIGHBOUR = 0.5
+"""Of the lower end of a band: other modes are expected from there downwards."""
+LEFT_OF_NEIGHBOURS = 1e-6
+"""Of the response of such a mode, what residual terms may leave."""
 
 
 class Output(str, Enum):
@@ -76,6 +78,18 @@ def _read_period(value: object, field: str) -> int | None:
     return cast(int, value)
 
 
+def residual_terms_of(ends_hz: tuple[float, float]) -> int:
+    """Residual terms that a band needs for modes beside it.
+
+    A polynomial of r terms follows the response of a pole beside a band up to ``rho^-r`` of it, rho the sum of
+    the half axes of the ellipse through the pole whose foci are the band's ends, over half the band's width
+    (Bernstein; Trefethen, Approximation Theory and Approximation Practice (2013), theorem 8.2).
+    """
+    low_hz, high_hz = ends_hz
+    away = (low_hz + high_hz - 2 * NEIGHBOUR * low_hz) / (high_hz - low_hz)
+    return math.ceil(-math.log(LEFT_OF_NEIGHBOURS) / math.acosh(away))
+
+
 @dataclass(frozen=True)
 class SensorUse:
     """The sensor and how it is used.
@@ -94,7 +108,7 @@ class SensorUse:
     sample_rate_hz : float
     samples_per_period : int or None
         Lines are multiples of their ratio; a block is one period. None (``auto``): the plan chooses it, see
-        `tactile_resonance.scan.period`.
+        `tactile_resonance.scan.measurement`.
     level_v : float
         Drive [V rms], if the sensor's whole range were excited: the amplitude of each line follows from
         it, however few are.

@@ -13,20 +13,26 @@ from tactile_resonance.contact.force_spread import spread_of
 from tactile_resonance.multisine import Grid
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
-from tactile_resonance.scan.measurement import design_measurement, excitation_of
-from tactile_resonance.scan.period import (
+from tactile_resonance.scan.measurement import (
     LEAST_DISTANCE,
     LONGER,
+    design_measurement,
+    excitation_of,
     lines_of,
     lines_wanted,
     mains_distances,
     mains_in,
-    residual_terms_of,
     shortest_samples,
 )
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.plan_text import plan_rows
-from tactile_resonance.scan.scene import Gate, Output, parse_scan_scene, read_scan_scene
+from tactile_resonance.scan.scene import (
+    Gate,
+    Output,
+    parse_scan_scene,
+    read_scan_scene,
+    residual_terms_of,
+)
 
 SCENE = share_path("config/scenes/two_gelatines.yaml")
 
