@@ -15,9 +15,16 @@ from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.goal import Frames, ScanGoal
-from tactile_resonance.scan.hands import Check, Interrupted, PointFailed, ScanEnded, Touch
+from tactile_resonance.scan.hands import (
+    Check,
+    Interrupted,
+    PointFailed,
+    Progress,
+    ScanEnded,
+    Summary,
+    Touch,
+)
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.progress import Progress, Summary
 from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.table_calibration import (
     NOT_ESTIMATED,

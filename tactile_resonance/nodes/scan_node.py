@@ -39,10 +39,17 @@ from tactile_resonance.nodes.scan_actions import (
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.scan_time import ScanTime
 from tactile_resonance.scan.goal import Frames, GoalFiles, named_frames, resumed_run
-from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded
+from tactile_resonance.scan.hands import (
+    Controls,
+    Interrupted,
+    Phase,
+    PointFailed,
+    Progress,
+    Request,
+    ScanEnded,
+)
 from tactile_resonance.scan.point_result import TOPIC
 from tactile_resonance.scan.preparation import UNCHECKED
-from tactile_resonance.scan.progress import Controls, Phase, Progress, Request
 from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.run_start import new_run, start_run
 from tactile_resonance.scan.runner import ScanRunner

@@ -16,11 +16,10 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.scan.clearance import Standoffs, TipUse
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal, read_goal, resumed_run
-from tactile_resonance.scan.hands import Check, Hands, Touch
+from tactile_resonance.scan.hands import Check, Hands, Phase, Progress, Touch
 from tactile_resonance.scan.plan import Plan, plan_points
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.preparation import prepare
-from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, ended_by_storage, expected_bytes
 from tactile_resonance.scan.scene import ScanScene, read_run_scene

@@ -18,19 +18,23 @@ from tactile_resonance.scan.decision import Decision, GateKeeper, Verdict, decid
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Check,
+    Controls,
     Disturbances,
     Hands,
     Interrupted,
     Measured,
+    Phase,
     PointDisturbed,
     PointFailed,
+    Progress,
+    Request,
     ScanEnded,
+    Summary,
 )
 from tactile_resonance.scan.plan import Plan
 from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.progress import Controls, Phase, Progress, Request, Summary
 from tactile_resonance.scan.references import AFTER, BEFORE, SILENT, read_reference, sensor_health
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory, ended_by_storage
 from tactile_resonance.scan.scene import OnFailure, Output
