@@ -49,9 +49,8 @@ from tactile_resonance.scan.hands import (
     ScanEnded,
 )
 from tactile_resonance.scan.point_result import TOPIC
-from tactile_resonance.scan.preparation import UNCHECKED
 from tactile_resonance.scan.recorded import recorded_results
-from tactile_resonance.scan.run_start import new_run, start_run
+from tactile_resonance.scan.run_start import UNCHECKED, new_run, start_run
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.table_calibration import CalibrationRequest
 

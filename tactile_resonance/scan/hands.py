@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scan and its robot, its node and its operator tell each other; how a point may end without a result."""
+"""What a scan and its robot, node and operator tell each other; how a point may end without a result."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
 
 Where a scene leaves the period to the plan (``samples_per_period: auto``), it is the shortest of which one
 block, from rest, gives a pole with a covariance to be relied on, and away from the mains. Each band holds as
-many lines as response and transient have coefficients for, and `FREE_LINES`; its residual terms follow the modes
-beside it (`scene.residual_terms_of`). So the wider a band, the shorter the period.
+many lines as response and transient have coefficients for, and `FREE_LINES`; its residual terms follow the
+modes beside it (`scene.residual_terms_of`). So the wider a band, the shorter the period.
 
 The lines sound one after the other, from low to high, for a mode that is excited early rings within the
 record: at 59 ms its f0 is more than twice as precise as with random phases. One or two blocks cannot
