@@ -24,8 +24,8 @@ from tactile_resonance.scan.hands import (
     Summary,
     Touch,
 )
+from tactile_resonance.scan.point_outcome import SensorHealth
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.table_calibration import (
     NOT_ESTIMATED,
     CalibrationRequest,

@@ -19,8 +19,8 @@ if TYPE_CHECKING:  # nodes that take goals need what may go wrong, and load noth
     from tactile_resonance.record import Origin
     from tactile_resonance.scan.clearance import Standoffs
     from tactile_resonance.scan.measurement import MeasurementDesign
+    from tactile_resonance.scan.point_outcome import SensorHealth
     from tactile_resonance.scan.points import ScanPoint
-    from tactile_resonance.scan.references import SensorHealth
     from tactile_resonance.scan.run_directory import PointRecording
     from tactile_resonance.scan.tissue_tests import ProtocolRequest
 

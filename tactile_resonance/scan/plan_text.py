@@ -24,8 +24,8 @@ from tactile_resonance.scan.measurement import (
     mains_in,
 )
 from tactile_resonance.scan.plan import Plan
+from tactile_resonance.scan.point_outcome import SILENT
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
-from tactile_resonance.scan.references import SILENT
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import Output, ScanScene
 from tactile_resonance.scan.surface import TouchRequest

@@ -32,10 +32,18 @@ from tactile_resonance.scan.hands import (
     Summary,
 )
 from tactile_resonance.scan.plan import Plan
-from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result
+from tactile_resonance.scan.point_outcome import (
+    AFTER,
+    BEFORE,
+    SILENT,
+    air_point,
+    attempt_at,
+    measured_result,
+    read_reference,
+    sensor_health,
+)
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.references import AFTER, BEFORE, SILENT, read_reference, sensor_health
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory, ended_by_storage
 from tactile_resonance.scan.scene import OnFailure, Output
 from tactile_resonance.scan.tissue_tests import ProtocolRequest, fits_of, write_fits

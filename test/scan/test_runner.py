@@ -23,8 +23,8 @@ from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.hands import Controls, Request
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import read_messages
+from tactile_resonance.scan.point_outcome import SensorHealth
 from tactile_resonance.scan.point_result import TYPE, PointOutcome
-from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
