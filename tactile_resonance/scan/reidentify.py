@@ -33,6 +33,7 @@ from tactile_resonance.scan.kept_bins import (
     PLACE,
     BinsKind,
     KeptBins,
+    Rows,
     RowsWriter,
     keep_bins,
     kept_bins,
@@ -148,13 +149,13 @@ def reidentify(
             left_out += [f"{run}: {text}" for text in kept[-1].left_out]
             for kind, _ in kept[-1].kinds:
                 _plan(kind, band, model)  # raises what does not suit
-        total, done = sum(of_run.count for of_run in kept), 0
+        total, done = sum(rows.count for of_run in kept for _, rows in of_run.kinds), 0
         if total == 0:
             raise ValueError(f"no point to identify: {'; '.join(left_out[:3]) or 'none is finished'}")
         jobs = (
-            (dtype, *job)
-            for k, run in enumerate(kept)
-            for job in _jobs(k, run, bands[k], structures[k])
+            (dtype, k, str(runs[k]), *piece, bands[k], structures[k])
+            for k, of_run in enumerate(kept)
+            for piece in _pieces(of_run)
         )
         try:
             with RowsWriter(npz) as writer, part.open("w", encoding="utf-8") as text:
@@ -180,14 +181,12 @@ def reidentify(
     return +counts, left_out
 
 
-def _jobs(
-    run: int, kept: KeptBins, band_hz: tuple[float, float], structure: ModelStructure
-) -> Iterator[tuple]:
+def _pieces(kept: KeptBins) -> Iterator[tuple[BinsKind, Rows, int, int]]:
+    """Some rows of one kind each, from the one to the other."""
     for kind, rows in kept.kinds:
         size = max(1, BYTES_AT_ONCE // rows.dtype.itemsize)
         for start in range(0, rows.count, size):
-            stop = min(start + size, rows.count)
-            yield run, str(kept.run), kind, rows, start, stop, band_hz, structure
+            yield kind, rows, start, min(start + size, rows.count)
 
 
 @lru_cache(maxsize=32)
