@@ -31,7 +31,7 @@ from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.poles.basis import default_transient_terms
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Separate
-from tactile_resonance.scan.scene import Output, ScanScene, SensorUse
+from tactile_resonance.scan.scene import Output, ScanScene
 from tactile_resonance.tones import MAINS_HZ
 
 # Beside the band of the fit: the local polynomial method looks at neighbours, the fit does not.
@@ -118,7 +118,7 @@ class MeasurementDesign:
     blocks: BlockLimits
     periods: int
     lines: int
-    skipped: tuple[Skipped, ...]
+    skipped: tuple[Skipped, ...] = ()
     sweep: bool = False
     silent: bool = False
     air: MeasurementDesign | None = None
@@ -133,7 +133,8 @@ class MeasurementDesign:
         """The same, or that for air, with as many blocks as a reference has."""
         if self.air is not None:
             return self.air.of_reference
-        return replace(self, periods=_of_reference(self.blocks, self.block_s))
+        fewest = math.ceil(REFERENCE_S / self.block_s - 1e-9)
+        return replace(self, periods=max(self.blocks.least, fewest))
 
 
 def design_measurement(scene: ScanScene) -> MeasurementDesign:
@@ -185,29 +186,35 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
                 f"sensor: got {found} excited lines in the band {band.low_hz:g} to {band.high_hz:g} Hz, "
                 f"{spacing_hz:g} Hz apart; accepted is more than {fewest}"
             )
-    skipped = [_only_poles(use, lines, spacing_hz, top_hz)] if narrow else []
-    if not distortion:
-        skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
-    if Output.SILENT not in outputs:
-        each_s = block_s if air is None else air.block_s
-        silent_s = _of_reference(blocks if air is None else air.blocks, each_s) * each_s
-        skipped.append(Skipped("a silent record", "silent is not wanted", silent_s))
-    if Output.MAP not in outputs:
-        skipped.append(Skipped("pole_map.png and map.mcap", "no map is wanted"))
-    return MeasurementDesign(
+    design = MeasurementDesign(
         bands=use.bands if air is None else air.bands,
         stretches_hz=stretches_hz,
         grid=Grid.ODD_RANDOM if distortion else Grid.FULL,
-        level_v=_level_v(use, lines, spacing_hz),
+        # each line at the amplitude that it has where the sensor's whole range is excited
+        level_v=use.level_v * math.sqrt(lines / lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz)),
         sample_rate_hz=use.sample_rate_hz,
         samples=samples,
         blocks=blocks,
         periods=blocks.most,
         lines=lines,
-        skipped=tuple(skipped),
         sweep=use.calibrated or (use.samples_per_period is None and not distortion),
         air=air,
     )
+    skipped = []
+    if narrow:
+        of_whole = lines_of((F_MIN_HZ, top_hz), spacing_hz)
+        named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
+        text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
+        skipped.append(Skipped(text, f"only poles from {named} are wanted"))
+    if not distortion:
+        skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
+    if Output.SILENT not in outputs:
+        silent = design.of_reference
+        silent_s = silent.periods * silent.block_s
+        skipped.append(Skipped("a silent record", "silent is not wanted", silent_s))
+    if Output.MAP not in outputs:
+        skipped.append(Skipped("pole_map.png and map.mcap", "no map is wanted"))
+    return replace(design, skipped=tuple(skipped))
 
 
 def _design_in_air(scene: ScanScene) -> MeasurementDesign:
@@ -223,18 +230,6 @@ def _design_in_air(scene: ScanScene) -> MeasurementDesign:
     require(scene.gate is None, "gate", scene.gate, accepted)
     plain = replace(use, calibrated=False, samples_per_period=None)
     return design_measurement(replace(scene, sensor=plain, blocks=None))
-
-
-def _only_poles(use: SensorUse, lines: int, spacing_hz: float, top_hz: float) -> Skipped:
-    of_whole = lines_of((F_MIN_HZ, top_hz), spacing_hz)
-    named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
-    text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
-    return Skipped(text, f"only poles from {named} are wanted")
-
-
-def _level_v(use: SensorUse, lines: int, spacing_hz: float) -> float:
-    """Of so many lines, each at the amplitude that it has where the sensor's whole range is excited [V rms]."""
-    return use.level_v * math.sqrt(lines / lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz))
 
 
 def excitation_of(design: MeasurementDesign, seed: int) -> Excitation:
@@ -275,11 +270,6 @@ def _default_blocks(scene: ScanScene, block_s: float) -> BlockLimits:
     if scene.sensor.samples_per_period is not None:
         return usual
     return BlockLimits(least, max(usual.most, math.ceil(MOST_S / block_s - 1e-9)))
-
-
-def _of_reference(blocks: BlockLimits, block_s: float) -> int:
-    """Blocks of a reference."""
-    return max(blocks.least, math.ceil(REFERENCE_S / block_s - 1e-9))
 
 
 def lines_of(ends_hz: tuple[float, float], spacing_hz: float, share: float = 1.0) -> int:

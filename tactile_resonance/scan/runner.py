@@ -133,9 +133,15 @@ class ScanRunner:
         return ""
 
     def _next(self) -> ScanPoint | None:
-        """The point to touch next; waits while the scan is paused or a node is away."""
+        """The point to touch next; waits while the scan is paused or a node is away.
+
+        The first that is not finished; an adaptive scan chooses and appends one where all are.
+        """
         self._wait()
-        point = self._known_next()
+        if (point := self._run.next_point) is None:
+            content = self._run.content
+            chosen = self._plan.next_point(content.points, content.latest)
+            point = None if chosen is None else self._run.append(chosen)
         request = self._controls.take()
         if request is Request.REPEAT and (content := self._run.content).results:
             latest = max(content.results, key=lambda result: result.time_ns)
@@ -146,14 +152,6 @@ class ScanRunner:
                 self._publish(recording.finish(result))
             return self._next()
         return point
-
-    def _known_next(self) -> ScanPoint | None:
-        """The first point that is not finished; an adaptive scan chooses and appends one where all are."""
-        if (point := self._run.next_point) is not None:
-            return point
-        content = self._run.content
-        chosen = self._plan.next_point(content.points, content.latest)
-        return None if chosen is None else self._run.append(chosen)
 
     def _wait(self) -> None:
         """With the tip free, while the scan is paused or a node is held, and until all are at work."""
