@@ -21,7 +21,7 @@ from tactile_resonance.report.paper_figures import paper_figures
 from tactile_resonance.report.point_details import PointDetails, lines_each
 from tactile_resonance.report.run_tables import SURE, Truths, repeats_sentence, table_notes
 from tactile_resonance.scan.decision import Verdict
-from tactile_resonance.scan.plan_text import plan_against_outcome
+from tactile_resonance.scan.plan import plan_against_outcome
 from tactile_resonance.scan.point_outcome import (
     SILENT,
     SensorHealth,

@@ -338,6 +338,18 @@ def _enough(bands: Sequence[PoleBand], spacing_hz: float, share: float) -> bool:
     return all(lines_of(band.ends_hz, spacing_hz, share) >= lines_wanted(band) for band in bands)
 
 
+def mains_sentence(design: MeasurementDesign) -> str:
+    """Which harmonics of the mains cannot be distinguished from the response at excited lines."""
+    hum_hz = mains_in(design.bands)
+    spacing_hz = design.sample_rate_hz / design.samples
+    near = [hz for hz in hum_hz if mains_distances(np.array([hz]), spacing_hz) < LEAST_DISTANCE]
+    distance = f"{LEAST_DISTANCE:g} of the spacing of lines"
+    if not near:
+        return f"harmonics of 50 and 60 Hz in the bands are {distance} or more from the next line"
+    names = ", ".join(f"{hz:g}" for hz in near)
+    return f"hum at {names} Hz would count as response: it is within {distance} from the next line"
+
+
 def mains_distances(hum_hz: FloatArray, spacing_hz: npt.ArrayLike) -> FloatArray:
     """(...) how near one of these frequencies (h,) comes to a multiple of each spacing (...) [Hz].
 
