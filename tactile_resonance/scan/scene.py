@@ -359,21 +359,21 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     keys = {item.name for item in fields(ScanScene)} - {"positions_m", "adaptive"} | {"positions"}
     known_keys(content, keys | BENCH_KEYS, where)
     content = with_library(content, path)
-    given: dict[str, Any] = {}
-    given["tissue_classes"], given["nominal_contact"] = _read_tissues(content, where)
+    nominal, named = parse_nominal_contact(content, where), content.get("tissue_classes")
+    accepted = "classes, to which nominal_contact belongs (they are missing)"
+    require(named is not None or nominal is None, f"{where} tissue_classes", named, accepted)
+    classes = () if named is None else parse_classes(named, f"{where} tissue_classes")
+    given: dict[str, Any] = {"tissue_classes": classes, "nominal_contact": nominal}
     positions = section(content, "positions", where)
     if "adaptive" in positions:
         require(len(positions) == 1, f"{where} positions", [*positions], "adaptive, or another one")
         asked = section(positions, "adaptive", f"{where} positions")
-        given["adaptive"] = read_adaptive(
-            asked, given["tissue_classes"], f"{where} positions.adaptive"
-        )
+        given["adaptive"] = read_adaptive(asked, classes, f"{where} positions.adaptive")
         given["positions_m"] = flat(given["adaptive"].places_m())
         require_near(given["positions_m"], f"{where} positions.adaptive")
     else:
         given["positions_m"] = read_positions(positions, f"{where} positions")
     if "precision" in content:
-        classes = given["tissue_classes"]
         given["precision"] = _read_precision(content["precision"], classes, f"{where} precision")
     if "surface" in content:
         surface = section(content, "surface", where)
@@ -386,19 +386,6 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     handled = {*given, "positions", *BENCH_KEYS}
     rest = {key: value for key, value in content.items() if key not in handled}
     return read_dataclass(ScanScene, {"name": path.stem, **rest}, where, **given)
-
-
-def _read_tissues(
-    content: Mapping[str, Any], where: str
-) -> tuple[tuple[TissueClass, ...], NominalContact | None]:
-    """Classes and the contact to which they refer."""
-    nominal = parse_nominal_contact(content, where)
-    classes = content.get("tissue_classes")
-    if classes is None:
-        accepted = "classes, to which nominal_contact belongs (they are missing)"
-        require(nominal is None, f"{where} tissue_classes", None, accepted)
-        return (), None
-    return parse_classes(classes, f"{where} tissue_classes"), nominal
 
 
 @dataclass(frozen=True)
