@@ -91,13 +91,12 @@ def measured_result(
     """
     poles = measured.poles
     result = with_poles(
-        attempt,
+        replace(attempt, contact_age_s=measured.contact_age_s),
         poles,
         measured.origin,
         scene.tissue_classes,
         scene.unknown_level,
         nominal=scene.nominal_contact,
-        age_s=measured.contact_age_s,
     )
     if air is not None:
         result = replace(result, **relative_to_air(result.estimate, result.covariance, air))
@@ -120,13 +119,13 @@ def with_poles(
     classes: Sequence[TissueClass] = (),
     unknown_level: float = 0.01,
     nominal: NominalContact | None = None,
-    age_s: float = NAN,
 ) -> PointResult:
     """The result with what poles say of its point; of several modes the one with the highest peak.
 
     Parameters
     ----------
     result : PointResult
+        With the age of the contact, where that is known.
     poles : Poles
     origin : Origin
         Of the poles, with the force.
@@ -136,8 +135,6 @@ def with_poles(
         See `classify`.
     nominal : NominalContact or None
         To which the classes refer.
-    age_s : float
-        Of the contact in the middle of the measurement [s]; NaN where unknown.
     """
     contact, mode = origin.contact, poles.main
     result = replace(
@@ -147,7 +144,6 @@ def with_poles(
         force_rms_n=contact.spread.rms_n,
         force_min_n=contact.spread.min_n,
         force_max_n=contact.spread.max_n,
-        contact_age_s=age_s,
         **mode_columns(mode.estimate, mode.covariance),
         f0_drift_hz_per_s=float(mode.drift[0]),
         f0_drift_std_hz_per_s=float(mode.drift_std[0]),
@@ -164,7 +160,7 @@ def with_poles(
     )
     if not (classes and mode.found):
         return result
-    pressed = ContactLoad(contact.force_n, contact.force_std_n, age_s)
+    pressed = ContactLoad(contact.force_n, contact.force_std_n, result.contact_age_s)
     at = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
     call = classify(at.compared, at.covariance, classes, unknown_level)
     known = bool(np.all(np.isfinite(at.compared)))
