@@ -22,13 +22,13 @@ import numpy as np
 
 from benchmarks.skip_hands import VirtualHands
 from tactile_resonance.commands.report import report_run
+from tactile_resonance.scan.hands import Controls
 from tactile_resonance.scan.map_messages import cloud_message, marker_message, surface_message
 from tactile_resonance.scan.messages import header_message, message_types, to_cdr
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import FileContent
 from tactile_resonance.scan.point_result import TYPE, PointResult, from_message, serialised
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
-from tactile_resonance.scan.progress import Controls
 from tactile_resonance.scan.run_content import (
     RECORDING,
     entry_of,

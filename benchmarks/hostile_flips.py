@@ -110,7 +110,7 @@ def _bins(run: Path) -> tuple[str, object]:
     if kept is None:
         return "", "made anew"
     rows = [rows.read(0, rows.count).tobytes() for _, rows in kept.kinds]
-    return _text((kept.band_hz, [kind for kind, _ in kept.kinds], rows, kept.left_out)), ""
+    return _text(([kind for kind, _ in kept.kinds], rows, kept.left_out)), ""
 
 
 def _text(content: object) -> str:

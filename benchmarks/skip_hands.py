@@ -18,12 +18,11 @@ from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.clearance import Standoffs
-from tactile_resonance.scan.hands import Check, Measured, PointFailed, Touch
+from tactile_resonance.scan.hands import Check, Controls, Measured, PointFailed, Touch
 from tactile_resonance.scan.measurement import MeasurementDesign, excitation_of
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.plan import TRAVEL_M_S, make_plan
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.progress import Controls
 from tactile_resonance.scan.run_content import RunContent, read_run
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory
 from tactile_resonance.scan.runner import ScanRunner

@@ -338,7 +338,7 @@ def _analyze_contacts(options: argparse.Namespace) -> int:
     sensor = read_calibration(options.calibration)
     run = read_run(options.record) if (options.record / "run.json").is_file() else None
     if run is not None:
-        from tactile_resonance.scan.references import calibration_in_air
+        from tactile_resonance.scan.point_outcome import calibration_in_air
 
         in_air = calibration_in_air(run, sensor.calibration)
         print(f"sensor in air: {in_air.message}")

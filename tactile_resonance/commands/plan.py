@@ -38,8 +38,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read the scene, compile it, print, draw."""
     # only here: the command answers --help without the libraries of scans
-    from tactile_resonance.scan.plan import make_plan
-    from tactile_resonance.scan.plan_text import plan_rows
+    from tactile_resonance.scan.plan import make_plan, plan_rows
     from tactile_resonance.scan.scene import read_scan_scene
 
     plan = make_plan(read_scan_scene(options.scene))

@@ -84,7 +84,7 @@ def report_run(folder: Path) -> int:
         summary,
     )
     from tactile_resonance.report.run_tables import point_table, table_notes
-    from tactile_resonance.scan.plan_text import map_names
+    from tactile_resonance.scan.plan import map_names
     from tactile_resonance.scan.run_content import not_checked
 
     details, boundary = details_of(content), boundary_of_run(content)

@@ -231,7 +231,6 @@ class PoleMapNode(ManagedNode):
                 self._classes if band == 1 else (),
                 level,
                 self._nominal,
-                result.contact_age_s,
             )
             point = MapPoint.of_tip(result, origin)
             if not self._frame_id:

@@ -15,8 +15,8 @@ from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.goal import ScanGoal
-from tactile_resonance.scan.progress import Controls, Progress, Request, Summary
-from tactile_resonance.scan.references import SensorHealth
+from tactile_resonance.scan.hands import Controls, Progress, Request, Summary
+from tactile_resonance.scan.point_outcome import SensorHealth
 from tactile_resonance.scan.table_calibration import (
     NOT_ESTIMATED,
     CalibrationRequest,

@@ -32,13 +32,19 @@ from tactile_resonance.nodes.scan_actions import (
 )
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.scan.goal import Frames, GoalFiles, named_frames, resumed_run
-from tactile_resonance.scan.hands import Interrupted, PointFailed, ScanEnded, Touch
+from tactile_resonance.scan.hands import (
+    Interrupted,
+    Phase,
+    PointFailed,
+    Progress,
+    Request,
+    ScanEnded,
+    Touch,
+)
 from tactile_resonance.scan.point_result import TOPIC
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.preparation import UNCHECKED
-from tactile_resonance.scan.progress import Phase, Progress, Request
 from tactile_resonance.scan.recorded import recorded_results
-from tactile_resonance.scan.run_start import new_run, start_run
+from tactile_resonance.scan.run_start import UNCHECKED, new_run, start_run
 from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.table_calibration import CalibrationRequest, as_text, calibrate_table
 from tactile_resonance.sensor import sensor_named

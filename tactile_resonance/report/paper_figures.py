@@ -25,9 +25,9 @@ from tactile_resonance.report.drawing import PROBABILITY
 from tactile_resonance.report.page import evenly, listed, s_plane
 from tactile_resonance.report.point_details import FRF_TYPE, PointDetails
 from tactile_resonance.scan.point_file import read_messages
+from tactile_resonance.scan.point_outcome import BEFORE, read_reference
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.recorded import measurements_of_file
-from tactile_resonance.scan.references import BEFORE, read_reference
 from tactile_resonance.scan.run_content import RunContent, file_of
 
 Figure = dict[str, Any]

@@ -21,12 +21,16 @@ from tactile_resonance.report.paper_figures import paper_figures
 from tactile_resonance.report.point_details import PointDetails, lines_each
 from tactile_resonance.report.run_tables import SURE, Truths, repeats_sentence, table_notes
 from tactile_resonance.scan.decision import Verdict
-from tactile_resonance.scan.plan_text import plan_against_outcome
-from tactile_resonance.scan.point_outcome import budget_sentence
+from tactile_resonance.scan.plan import plan_against_outcome
+from tactile_resonance.scan.point_outcome import (
+    SILENT,
+    SensorHealth,
+    budget_sentence,
+    sensor_health,
+)
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
 from tactile_resonance.scan.recorded import measurements_of_file
-from tactile_resonance.scan.references import SILENT, SensorHealth, sensor_health
 from tactile_resonance.scan.run_content import RunContent, not_checked
 from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
 from tactile_resonance.scan.tissue_tests import TYPE as TEST_TYPE

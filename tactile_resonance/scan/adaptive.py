@@ -147,10 +147,8 @@ class Adaptive:
     def loss(self, surface: KrigedSurface) -> float:
         """What is left over the region: m^2, or Hz^2 m^2."""
         raster = self.raster
-        return (
-            float(np.sum(self.wanted.loss(*surface.predict(raster.xy_m[raster.within]))))
-            * raster.cell_m2
-        )
+        left = self.wanted.loss(*surface.predict(raster.xy_m[raster.within]))
+        return float(np.sum(left)) * raster.cell_m2
 
     def boundary(self, results: Iterable[PointResult]) -> Boundary | None:
         """Boundary that the points of a scan lead to; None where none is wanted, or they are too few."""

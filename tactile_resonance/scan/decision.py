@@ -213,30 +213,20 @@ def decide(
     else:
         mains = (band.main for band in poles.bands)
         modes = [(mode.estimate, mode.covariance, mode.noise) for mode in mains]
-    found = [_verdict(*mode, blocks, wanted, limits) for mode in modes]
+    found = []
+    for estimate, covariance, noise in modes:
+        verdict, called = Verdict.CONTINUE, ""
+        known = np.all(np.isfinite(covariance)) and np.all(np.isfinite(estimate))
+        if blocks >= limits.least and wanted is not None and known:
+            verdict, called = wanted.verdict(estimate, covariance, noise, blocks, limits)
+        if verdict is Verdict.CONTINUE and blocks >= limits.most:
+            verdict = Verdict.MOST_BLOCKS
+        found.append((verdict, called))
     imprecise = [each for each in found if each[0] is not Verdict.PRECISE] or found
     undecided = (each for each in imprecise if each[0] is Verdict.CONTINUE)
     verdict, called = next(undecided, imprecise[0])
     saved = 0 if verdict is Verdict.CONTINUE else max(0, limits.most - blocks)
     return Decision(verdict, blocks, saved, saved * block_s, called)
-
-
-def _verdict(
-    estimate: FloatArray,
-    covariance: FloatArray,
-    noise: FloatArray,
-    blocks: int,
-    wanted: Precise | Separate | None,
-    limits: BlockLimits,
-) -> tuple[Verdict, str]:
-    """Of one mode, of which nothing may be known yet: verdict and class."""
-    verdict, called = Verdict.CONTINUE, ""
-    known = np.all(np.isfinite(covariance)) and np.all(np.isfinite(estimate))
-    if blocks >= limits.least and wanted is not None and known:
-        verdict, called = wanted.verdict(estimate, covariance, noise, blocks, limits)
-    if verdict is Verdict.CONTINUE and blocks >= limits.most:
-        verdict = Verdict.MOST_BLOCKS
-    return verdict, called
 
 
 @dataclass(frozen=True)

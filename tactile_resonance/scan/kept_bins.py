@@ -93,26 +93,10 @@ class BinsKind:
 
 @dataclass(frozen=True)
 class KeptBins:
-    """The points of a run by the kinds of their records.
+    """The points of a run by the kinds of their records; points without bins, and why."""
 
-    Attributes
-    ----------
-    run : Path
-    band_hz : (low, high)
-    kinds : tuple of (BinsKind, Rows)
-    left_out : tuple of str
-        Points without bins, and why.
-    """
-
-    run: Path
-    band_hz: tuple[float, float]
     kinds: tuple[tuple[BinsKind, Rows], ...]
     left_out: tuple[str, ...]
-
-    @property
-    def count(self) -> int:
-        """Points."""
-        return sum(rows.count for _, rows in self.kinds)
 
 
 def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
@@ -150,7 +134,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         return None
     within = low_hz <= band_hz[0] and band_hz[1] <= high_hz
     pairs = tuple(zip(kinds, rows, strict=True))
-    return KeptBins(run, (low_hz, high_hz), pairs, tuple(content["left_out"])) if within else None
+    return KeptBins(pairs, tuple(content["left_out"])) if within else None
 
 
 def bins_of_point(

@@ -224,10 +224,7 @@ def krige(
         If there are too few points, or two exact ones in one place.
     """
     xy, y, noise = (np.asarray(v, float) for v in (xy_m, values, noise_std))
-    require(xy.ndim == 2 and xy.shape[1] == 2, "xy_m", xy.shape, "shape (n, 2)")
     require(len(xy) >= LEAST_POINTS, "xy_m", len(xy), f"{LEAST_POINTS} points or more")
-    same = y.shape == noise.shape == (len(xy),)
-    require(same, "values, noise_std", (y.shape, noise.shape), f"shape ({len(xy)},)")
     good = bool(np.all(np.isfinite(xy)) and np.all(np.isfinite(y)) and np.all(noise >= 0))
     require(good and bool(np.all(np.isfinite(noise))), "values", "NaN", "finite numbers")
     distances = cdist(xy, xy)

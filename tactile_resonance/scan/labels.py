@@ -161,8 +161,7 @@ def reference_points(
             if isinstance(at, str):
                 left_out[at] += 1
                 continue
-            casting, place = _preparation(label, name), _position(label, result)
-            rows.append((*at, float(result.blocks), label.tissue, casting, place, name))
+            rows.append((*at, float(result.blocks), label.tissue, *_where(label, name, result), name))
     require(bool(rows), "points", dict(left_out), "one labelled point with poles or more")
     return ReferencePoints(*(np.array(column) for column in zip(*rows, strict=True))), left_out
 
@@ -225,18 +224,15 @@ def labelled_frfs(
                 continue
             sensed, driven = np.moveaxis(spectrum.by_period[..., harmonics], -3, 0)
             periods = (sensed / driven).reshape(-1, lines_hz.size)
-            casting, place = _preparation(label, name), _position(label, result)
+            where = _where(label, name, result)
             g.append(periods)
-            groups += [(label.tissue, casting, place, f"{name}, {result.index}")] * len(periods)
+            groups += [(label.tissue, *where, f"{name}, {result.index}")] * len(periods)
     require(bool(g), "points", dict(left_out), "one labelled point of two blocks or more")
     columns = [np.unique(column, return_inverse=True)[1] for column in zip(*groups, strict=True)]
     return np.concatenate(g), frequency_hz, np.stack(columns, axis=1), left_out
 
 
-def _preparation(label: Label, run: str) -> str:
-    return label.preparation or run
-
-
-def _position(label: Label, result: PointResult) -> str:
+def _where(label: Label, run: str, result: PointResult) -> tuple[str, str]:
+    """Preparation and position."""
     place = (f"{round(each / PLACE_M)}" for each in result.position_m[:2])
-    return label.position or ", ".join(place)
+    return label.preparation or run, label.position or ", ".join(place)

@@ -1,5 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measurement that a scene needs at each point, and what it leaves out."""
+"""The measurement that a scene needs at each point: its period, and what it leaves out.
+
+Where a scene leaves the period to the plan (``samples_per_period: auto``), it is the shortest of which one
+block, from rest, gives a pole with a covariance to be relied on, and away from the mains. Each band holds as
+many lines as response and transient have coefficients for, and `FREE_LINES`; its residual terms follow the
+modes beside it (`scene.residual_terms_of`). So the wider a band, the shorter the period.
+
+The lines sound one after the other, from low to high, for a mode that is excited early rings within the
+record: at 59 ms its f0 is more than twice as precise as with random phases. One or two blocks cannot
+distinguish hum from response. From the third block on it shows in bins between the lines, so that the period
+is up to `LONGER` times as long where this keeps the harmonics of the mains `LEAST_DISTANCE` from the lines.
+
+``tools/run.sh python -m benchmarks.skip_decision`` prints precision and coverage of one block on all tissues
+of the simulated bench, and what blocks of that period decide.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +21,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+import numpy.typing as npt
+
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.force_spread import SHORTEST_S
 from tactile_resonance.fields import require
 from tactile_resonance.multisine import Excitation, Grid, design_multisine
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Separate
-from tactile_resonance.scan.period import lines_of, shortest_samples
-from tactile_resonance.scan.scene import Output, ScanScene, SensorUse
+from tactile_resonance.scan.scene import Output, ScanScene
+from tactile_resonance.tones import MAINS_HZ
 
 # Beside the band of the fit: the local polynomial method looks at neighbours, the fit does not.
 MARGIN_LINES = 8
@@ -31,6 +49,14 @@ FEWEST_CALIBRATED = 5
 """Lines of a block: four parameters of a contact, three of them with priors."""
 REFERENCE_S = 0.8
 """Of vibration in a reference, at least: two periods of 0.4 s (arXiv 1805.00682)."""
+FREE_LINES = 12
+"""Excited lines of a band beyond those that its coefficients take up: the level of the noise is from them."""
+LEAST_DISTANCE = 0.15
+"""Of a harmonic of the mains from an excited line, in spacings of the lines."""
+LONGER = 1.15
+"""A period may be this much longer than the shortest to keep that distance."""
+LONGEST_S = 20.0
+"""Of a period: the time of a point is a minute."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +117,7 @@ class MeasurementDesign:
     blocks: BlockLimits
     periods: int
     lines: int
-    skipped: tuple[Skipped, ...]
+    skipped: tuple[Skipped, ...] = ()
     sweep: bool = False
     silent: bool = False
     air: MeasurementDesign | None = None
@@ -106,7 +132,8 @@ class MeasurementDesign:
         """The same, or that for air, with as many blocks as a reference has."""
         if self.air is not None:
             return self.air.of_reference
-        return replace(self, periods=_of_reference(self.blocks, self.block_s))
+        fewest = math.ceil(REFERENCE_S / self.block_s - 1e-9)
+        return replace(self, periods=max(self.blocks.least, fewest))
 
 
 def design_measurement(scene: ScanScene) -> MeasurementDesign:
@@ -158,29 +185,35 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
                 f"sensor: got {found} excited lines in the band {band.low_hz:g} to {band.high_hz:g} Hz, "
                 f"{spacing_hz:g} Hz apart; accepted is more than {fewest}"
             )
-    skipped = [_only_poles(use, lines, spacing_hz, top_hz)] if narrow else []
-    if not distortion:
-        skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
-    if Output.SILENT not in outputs:
-        each_s = block_s if air is None else air.block_s
-        silent_s = _of_reference(blocks if air is None else air.blocks, each_s) * each_s
-        skipped.append(Skipped("a silent record", "silent is not wanted", silent_s))
-    if Output.MAP not in outputs:
-        skipped.append(Skipped("pole_map.png and map.mcap", "no map is wanted"))
-    return MeasurementDesign(
+    design = MeasurementDesign(
         bands=use.bands if air is None else air.bands,
         stretches_hz=stretches_hz,
         grid=Grid.ODD_RANDOM if distortion else Grid.FULL,
-        level_v=_level_v(use, lines, spacing_hz),
+        # each line at the amplitude that it has where the sensor's whole range is excited
+        level_v=use.level_v * math.sqrt(lines / lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz)),
         sample_rate_hz=use.sample_rate_hz,
         samples=samples,
         blocks=blocks,
         periods=blocks.most,
         lines=lines,
-        skipped=tuple(skipped),
         sweep=use.calibrated or (use.samples_per_period is None and not distortion),
         air=air,
     )
+    skipped = []
+    if narrow:
+        of_whole = lines_of((F_MIN_HZ, top_hz), spacing_hz)
+        named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
+        text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
+        skipped.append(Skipped(text, f"only poles from {named} are wanted"))
+    if not distortion:
+        skipped.append(Skipped("even and odd distortion", "distortion is not wanted"))
+    if Output.SILENT not in outputs:
+        silent = design.of_reference
+        silent_s = silent.periods * silent.block_s
+        skipped.append(Skipped("a silent record", "silent is not wanted", silent_s))
+    if Output.MAP not in outputs:
+        skipped.append(Skipped("pole_map.png and map.mcap", "no map is wanted"))
+    return replace(design, skipped=tuple(skipped))
 
 
 def _design_in_air(scene: ScanScene) -> MeasurementDesign:
@@ -196,18 +229,6 @@ def _design_in_air(scene: ScanScene) -> MeasurementDesign:
     require(scene.gate is None, "gate", scene.gate, accepted)
     plain = replace(use, calibrated=False, samples_per_period=None)
     return design_measurement(replace(scene, sensor=plain, blocks=None))
-
-
-def _only_poles(use: SensorUse, lines: int, spacing_hz: float, top_hz: float) -> Skipped:
-    of_whole = lines_of((F_MIN_HZ, top_hz), spacing_hz)
-    named = " and ".join(f"{band.low_hz:g} to {band.high_hz:g} Hz" for band in use.bands)
-    text = f"{of_whole - lines} of {of_whole} lines, neither excited nor computed"
-    return Skipped(text, f"only poles from {named} are wanted")
-
-
-def _level_v(use: SensorUse, lines: int, spacing_hz: float) -> float:
-    """Of so many lines, each at the amplitude that it has where the sensor's whole range is excited [V rms]."""
-    return use.level_v * math.sqrt(lines / lines_of((F_MIN_HZ, F_MAX_HZ), spacing_hz))
 
 
 def excitation_of(design: MeasurementDesign, seed: int) -> Excitation:
@@ -250,6 +271,96 @@ def _default_blocks(scene: ScanScene, block_s: float) -> BlockLimits:
     return BlockLimits(least, max(usual.most, math.ceil(MOST_S / block_s - 1e-9)))
 
 
-def _of_reference(blocks: BlockLimits, block_s: float) -> int:
-    """Blocks of a reference."""
-    return max(blocks.least, math.ceil(REFERENCE_S / block_s - 1e-9))
+def lines_of(ends_hz: tuple[float, float], spacing_hz: float, share: float = 1.0) -> int:
+    """How many lines from the one end to the other are excited, of which this share is."""
+    low, high = (hz / spacing_hz for hz in ends_hz)
+    return int(share * (math.floor(high + 1e-9) - math.ceil(low - 1e-9) + 1))
+
+
+def lines_wanted(band: PoleBand) -> int:
+    """Lines of a band from which one period alone gives poles with a covariance to be relied on.
+
+    Those that the coefficients of response and transient take up, and `FREE_LINES`, from which the level of the
+    noise is estimated.
+    """
+    structure = ModelStructure.with_residual(band.order or 2, band.residual_terms)
+    coefficients = structure.parameters + structure.transient_terms
+    return math.ceil(coefficients / 2) + FREE_LINES
+
+
+def shortest_samples(
+    bands: Sequence[PoleBand], sample_rate_hz: float, share: float = 1.0, least_s: float = 0.0
+) -> int:
+    """Samples of the shortest period with enough lines in each band, and away from the mains where that can be.
+
+    Parameters
+    ----------
+    bands : sequence of PoleBand
+    sample_rate_hz : float
+    share : float
+        Of the lines that are excited.
+    least_s : float
+        Of the period.
+
+    Raises
+    ------
+    ValueError
+        If a band is so narrow that the period would be longer than `LONGEST_S`.
+    """
+    for band in bands:
+        width_hz = band.high_hz - band.low_hz
+        least_hz = lines_wanted(band) / share / LONGEST_S
+        if width_hz < least_hz:
+            raise ValueError(
+                f"sensor: got the band {band.low_hz:g} to {band.high_hz:g} Hz with samples_per_period auto; "
+                f"accepted is {least_hz:.2g} Hz wide or more, for a period of {LONGEST_S:g} s at most"
+            )
+    fewest = max(
+        int((lines_wanted(band) / share - 1) * sample_rate_hz / (band.high_hz - band.low_hz))
+        for band in bands
+    )
+    fewest = max(fewest, math.ceil(least_s * sample_rate_hz))
+    while not _enough(bands, sample_rate_hz / fewest, share):
+        fewest += 1
+    tried = [
+        samples
+        for samples in range(fewest, int(LONGER * fewest) + 1)
+        if _enough(bands, sample_rate_hz / samples, share)
+    ]
+    distances = mains_distances(mains_in(bands), sample_rate_hz / np.array(tried))
+    far = np.flatnonzero(distances >= LEAST_DISTANCE)
+    return tried[int(far[0] if far.size else np.argmax(distances))]
+
+
+def _enough(bands: Sequence[PoleBand], spacing_hz: float, share: float) -> bool:
+    """Whether each band holds as many lines as it needs."""
+    return all(lines_of(band.ends_hz, spacing_hz, share) >= lines_wanted(band) for band in bands)
+
+
+def mains_sentence(design: MeasurementDesign) -> str:
+    """Which harmonics of the mains cannot be distinguished from the response at excited lines."""
+    hum_hz = mains_in(design.bands)
+    spacing_hz = design.sample_rate_hz / design.samples
+    near = [hz for hz in hum_hz if mains_distances(np.array([hz]), spacing_hz) < LEAST_DISTANCE]
+    distance = f"{LEAST_DISTANCE:g} of the spacing of lines"
+    if not near:
+        return f"harmonics of 50 and 60 Hz in the bands are {distance} or more from the next line"
+    names = ", ".join(f"{hz:g}" for hz in near)
+    return f"hum at {names} Hz would count as response: it is within {distance} from the next line"
+
+
+def mains_distances(hum_hz: FloatArray, spacing_hz: npt.ArrayLike) -> FloatArray:
+    """(...) how near one of these frequencies (h,) comes to a multiple of each spacing (...) [Hz].
+
+    In units of the spacing: 0 is on a line, 0.5 in the middle between two, and where there are no frequencies.
+    """
+    at = hum_hz / np.asarray(spacing_hz, float)[..., None]
+    return np.asarray(np.abs(at - np.round(at)).min(axis=-1, initial=0.5))
+
+
+def mains_in(bands: Sequence[PoleBand]) -> FloatArray:
+    """Harmonics of the mains within bands, ascending [Hz]."""
+    top_hz = max(band.high_hz for band in bands)
+    hum_hz = np.unique(np.concatenate([np.arange(hz, top_hz + 1, hz) for hz in MAINS_HZ]))
+    inside = [(hum_hz >= band.low_hz) & (hum_hz <= band.high_hz) for band in bands]
+    return np.asarray(hum_hz[np.any(inside, axis=0)])

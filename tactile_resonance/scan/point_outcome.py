@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what happened at a point to its result: poles, tissue, and where its time went."""
+"""From what happened at a point to its result: poles, also against those in free air, tissue, time.
+
+References in free air are taken before and after a scan: points are compared with the first, and both together
+tell the sensor's health.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +11,38 @@ import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from enum import Enum
+from typing import Any
 
 import numpy as np
 
+from tactile_resonance._typing import FloatArray
+from tactile_resonance.calibration.model import Calibration
+from tactile_resonance.calibration.validity import Validity, check_in_air
 from tactile_resonance.contact.goal import State
 from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.record import Origin
+from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.decision import Decision
 from tactile_resonance.scan.hands import Measured
 from tactile_resonance.scan.point_result import (
     NAN,
+    POLES_TYPE,
     PointOutcome,
     PointResult,
     band_results,
     mode_columns,
 )
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.references import relative_to_air
-from tactile_resonance.scan.scene import ScanScene
+from tactile_resonance.scan.recorded import last_poles
+from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.scene import DriftLimits, ScanScene
 from tactile_resonance.tissue.classify import TissueClass, classify
 from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
+
+SILENT, BEFORE, AFTER = "silent", "air-before", "air-after"
+# A difference beyond so many of its standard deviations is no noise: once in 16 000.
+_SIGNIFICANT = 4.0
 
 
 def air_point(index: int) -> ScanPoint:
@@ -75,13 +91,12 @@ def measured_result(
     """
     poles = measured.poles
     result = with_poles(
-        attempt,
+        replace(attempt, contact_age_s=measured.contact_age_s),
         poles,
         measured.origin,
         scene.tissue_classes,
         scene.unknown_level,
         nominal=scene.nominal_contact,
-        age_s=measured.contact_age_s,
     )
     if air is not None:
         result = replace(result, **relative_to_air(result.estimate, result.covariance, air))
@@ -104,13 +119,13 @@ def with_poles(
     classes: Sequence[TissueClass] = (),
     unknown_level: float = 0.01,
     nominal: NominalContact | None = None,
-    age_s: float = NAN,
 ) -> PointResult:
     """The result with what poles say of its point; of several modes the one with the highest peak.
 
     Parameters
     ----------
     result : PointResult
+        With the age of the contact, where that is known.
     poles : Poles
     origin : Origin
         Of the poles, with the force.
@@ -120,8 +135,6 @@ def with_poles(
         See `classify`.
     nominal : NominalContact or None
         To which the classes refer.
-    age_s : float
-        Of the contact in the middle of the measurement [s]; NaN where unknown.
     """
     contact, mode = origin.contact, poles.main
     result = replace(
@@ -131,7 +144,6 @@ def with_poles(
         force_rms_n=contact.spread.rms_n,
         force_min_n=contact.spread.min_n,
         force_max_n=contact.spread.max_n,
-        contact_age_s=age_s,
         **mode_columns(mode.estimate, mode.covariance),
         f0_drift_hz_per_s=float(mode.drift[0]),
         f0_drift_std_hz_per_s=float(mode.drift_std[0]),
@@ -148,7 +160,7 @@ def with_poles(
     )
     if not (classes and mode.found):
         return result
-    pressed = ContactLoad(contact.force_n, contact.force_std_n, age_s)
+    pressed = ContactLoad(contact.force_n, contact.force_std_n, result.contact_age_s)
     at = refer_to_nominal(mode.estimate, mode.covariance, pressed, nominal)
     call = classify(at.compared, at.covariance, classes, unknown_level)
     known = bool(np.all(np.isfinite(at.compared)))
@@ -160,6 +172,117 @@ def with_poles(
         tissue_probability=call.probability,
         tissue_reason="; ".join(filter(None, [call.reason if known else "", at.note])),
     )
+
+
+def relative_to_air(
+    estimate: FloatArray, covariance: FloatArray, air: MainMode
+) -> dict[str, Any]:
+    """Compare f0 [Hz] and damping ratio (2,) of covariance (2, 2) with those in air.
+
+    The two measurements are independent: variances add, those of the ratio to first order.
+
+    Returns
+    -------
+    dict
+        By the names of their fields in `PointResult`.
+    """
+    shift = estimate - air.estimate
+    std = np.sqrt(np.diag(covariance) + np.diag(air.covariance))
+    ratio = estimate[0] / air.estimate[0]
+    relative = np.sqrt(
+        covariance[0, 0] / estimate[0] ** 2 + air.covariance[0, 0] / air.estimate[0] ** 2
+    )
+    return {
+        "f0_shift_hz": float(shift[0]),
+        "f0_shift_std_hz": float(std[0]),
+        "f0_over_air": float(ratio),
+        "f0_over_air_std": float(ratio * relative),
+        "damping_shift": float(shift[1]),
+        "damping_shift_std": float(std[1]),
+    }
+
+
+class SensorHealth(str, Enum):
+    """Whether the sensor has drifted between references."""
+
+    UNKNOWN = "unknown"
+    STEADY = "steady"
+    DRIFTED = "drifted"
+
+
+def judge_drift(
+    before: MainMode | None, after: MainMode | None, limits: DriftLimits
+) -> tuple[SensorHealth, str]:
+    """Whether the poles in air moved during the scan: beyond their uncertainty and beyond the limits.
+
+    Returns
+    -------
+    health : SensorHealth
+    sentence : str
+        For people, with the figures.
+    """
+    missing = [name for name, r in (("before", before), ("after", after)) if r is None]
+    if before is None or after is None:
+        return (
+            SensorHealth.UNKNOWN,
+            f"sensor health unknown: no poles in air {' and '.join(missing)}",
+        )
+    change = after.estimate - before.estimate
+    std = np.sqrt(np.diag(before.covariance) + np.diag(after.covariance))
+    most = np.array([limits.f0_hz, limits.damping_ratio])
+    figures = (
+        f"f0 in air {before.estimate[0]:.3f} Hz before, changed by {change[0]:+.4f} +- {std[0]:.2g} Hz; "
+        f"damping ratio {before.estimate[1]:.5f} before, changed by {change[1]:+.2g} +- {std[1]:.2g} "
+        f"(limits {most[0]:g} Hz, {most[1]:g})"
+    )
+    if not np.all(np.isfinite(std)):
+        return SensorHealth.UNKNOWN, f"sensor health unknown, no uncertainty in air: {figures}"
+    if np.any((np.abs(change) > _SIGNIFICANT * std) & (np.abs(change) > most)):
+        return (
+            SensorHealth.DRIFTED,
+            f"warning: the sensor drifted, poles relative to air are off by as much: {figures}",
+        )
+    return SensorHealth.STEADY, f"sensor steady: {figures}"
+
+
+def read_reference(run: RunContent, name: str) -> MainMode | None:
+    """Mode in air of a run's reference of a name, from the last poles of its file; None where there is none.
+
+    Raises
+    ------
+    ValueError
+        If its file is damaged.
+    """
+    found = _poles_of(run, name)
+    return found.main if found is not None and found.main.found else None
+
+
+def _poles_of(run: RunContent, name: str) -> Poles | None:
+    found = None
+    for path in run.paths(POLES_TYPE, reference=name):
+        if (message := last_poles(path)) is not None:
+            found, _ = poles_from_message(message)
+    return found
+
+
+def calibration_in_air(run: RunContent, calibration: Calibration) -> Validity:
+    """A calibrated sensor against the poles in air that a run began with, in all its bands.
+
+    Raises
+    ------
+    ValueError
+        If the file of the reference is damaged.
+    """
+    found = _poles_of(run, BEFORE)
+    modes = [] if found is None else [band.main for band in found.bands]
+    return check_in_air(
+        calibration, [mode.estimate for mode in modes], [mode.covariance for mode in modes]
+    )
+
+
+def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, str]:
+    """Whether the sensor has drifted between the references of a run."""
+    return judge_drift(read_reference(run, BEFORE), read_reference(run, AFTER), limits)
 
 
 FIELD_OF = {

@@ -23,16 +23,17 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance._typing import BoolArray, FloatArray, IntArray
+from tactile_resonance._typing import BoolArray
 from tactile_resonance.fields import read_dataclass, read_yaml, section
 from tactile_resonance.poles.estimator import identify_poles_from_bins
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.result import STATUSES, PolesBatch, PolesStatus
+from tactile_resonance.poles.result import STATUS_CODE, STATUSES, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.kept_bins import (
     PLACE,
     BinsKind,
     KeptBins,
+    Rows,
     RowsWriter,
     keep_bins,
     kept_bins,
@@ -148,13 +149,13 @@ def reidentify(
             left_out += [f"{run}: {text}" for text in kept[-1].left_out]
             for kind, _ in kept[-1].kinds:
                 _plan(kind, band, model)  # raises what does not suit
-        total, done = sum(of_run.count for of_run in kept), 0
+        total, done = sum(rows.count for of_run in kept for _, rows in of_run.kinds), 0
         if total == 0:
             raise ValueError(f"no point to identify: {'; '.join(left_out[:3]) or 'none is finished'}")
         jobs = (
-            (dtype, *job)
-            for k, run in enumerate(kept)
-            for job in _jobs(k, run, bands[k], structures[k])
+            (dtype, k, str(runs[k]), *piece, bands[k], structures[k])
+            for k, of_run in enumerate(kept)
+            for piece in _pieces(of_run)
         )
         try:
             with RowsWriter(npz) as writer, part.open("w", encoding="utf-8") as text:
@@ -180,14 +181,12 @@ def reidentify(
     return +counts, left_out
 
 
-def _jobs(
-    run: int, kept: KeptBins, band_hz: tuple[float, float], structure: ModelStructure
-) -> Iterator[tuple]:
+def _pieces(kept: KeptBins) -> Iterator[tuple[BinsKind, Rows, int, int]]:
+    """Some rows of one kind each, from the one to the other."""
     for kind, rows in kept.kinds:
         size = max(1, BYTES_AT_ONCE // rows.dtype.itemsize)
         for start in range(0, rows.count, size):
-            stop = min(start + size, rows.count)
-            yield run, str(kept.run), kind, rows, start, stop, band_hz, structure
+            yield kind, rows, start, min(start + size, rows.count)
 
 
 @lru_cache(maxsize=32)
@@ -220,31 +219,17 @@ def _identified(job: tuple) -> tuple[npt.NDArray, str]:
     there = np.isfinite(batch.poles_rad_s) & batch.significant
     _fill(rows, batch, there, np.where(known, total, batch.covariance))
     rows[STATUS] = batch.status_code
-    for k in np.flatnonzero(_unsure(batch, kind)):
+    sure = np.isin(batch.status_code, [STATUS_CODE[status] for status in _SURE])
+    if kind.realisations == 1:  # others have distortion, which no line has as much of as the next
+        sure &= batch.variance_model == "flat"
+    for k in np.flatnonzero(~sure):
         poles = identify_poles_from_bins(kind.bins(points[k]), band_hz, structure)
         names = ("poles_rad_s", "residues", "f0_hz", "damping_ratio", *_COSTS)
         alone = SimpleNamespace(**{name: np.asarray(getattr(poles, name))[None] for name in names})
         there = np.ones((1, poles.f0_hz.size), bool)
         _fill(rows[k : k + 1], alone, there, poles.best_covariance[None])
-        rows[STATUS][k] = STATUSES.index(poles.status)
+        rows[STATUS][k] = STATUS_CODE[poles.status]
     return rows, _as_csv(rows, name_of_run)
-
-
-def _unsure(batch: PolesBatch, kind: BinsKind) -> BoolArray:
-    """(n,) points whose fit shows that something is not as the model says."""
-    sure = np.isin(batch.status_code, [STATUSES.index(status) for status in _SURE])
-    if kind.realisations == 1:  # others have distortion, which no line has as much of as the next
-        sure &= batch.variance_model == "flat"
-    return ~sure
-
-
-def _main_first(peak: FloatArray) -> IntArray:
-    """(n, places) order of modes: the highest peak, then the others as they are, those without one last."""
-    places = np.tile(np.arange(peak.shape[1]), (len(peak), 1))
-    if peak.shape[1] == 0:
-        return places
-    rank = np.where(places == np.argmax(peak, axis=1)[:, None], -1, places)
-    return np.argsort(np.where(np.isneginf(peak), peak.shape[1] + places, rank), axis=1)
 
 
 def _fill(
@@ -256,7 +241,10 @@ def _fill(
     """Of a batch (n,): modes that are there (n, places), the one that `Poles.main` means first, with theirs."""
     with np.errstate(all="ignore"):
         peak = np.abs(found.residues) / np.abs(found.poles_rad_s.real)
-    order = _main_first(np.where(there, peak, -np.inf))
+    rank = np.where(there, 0, 1)  # those that are there as they are, behind the one of the highest peak
+    if rank.shape[1]:
+        rank[np.arange(len(rank)), np.argmax(np.where(there, peak, -np.inf), axis=1)] = -1
+    order = np.argsort(rank, axis=1, kind="stable")
 
     def taken(values: npt.NDArray) -> npt.NDArray:
         wide = (..., *[None] * (values.ndim - 2))

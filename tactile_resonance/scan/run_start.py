@@ -14,21 +14,32 @@ from typing import Any
 from tactile_resonance.configuration import PACKAGE_NAME, package_version
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
-from tactile_resonance.scan.clearance import Standoffs, TipUse
+from tactile_resonance.scan.clearance import Standoffs, TipUse, clear_points
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal, read_goal, resumed_run
-from tactile_resonance.scan.hands import Check, Hands, Touch
-from tactile_resonance.scan.plan import Plan, plan_points
+from tactile_resonance.scan.hands import (
+    Check,
+    Hands,
+    Phase,
+    PointFailed,
+    Progress,
+    ScanEnded,
+    Touch,
+)
+from tactile_resonance.scan.measurement import Skipped
+from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.preparation import prepare
-from tactile_resonance.scan.progress import Phase, Progress
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory, ended_by_storage, expected_bytes
 from tactile_resonance.scan.scene import ScanScene, read_run_scene
+from tactile_resonance.scan.surface import Plane, TouchRequest
+from tactile_resonance.scan.surface_search import find_normals, find_surface
 from tactile_resonance.sensor import sensor_named
 
 _LIBRARIES = ("numpy", "scipy", "rosbags", "ur-rtde", "python-can")
-
-
+UNCHECKED = Skipped(
+    "the check that the housing is clear of the surface",
+    "how the sensor is used is not known: it is kept clear of a plane only",
+)
 StartedRun = tuple[Plan, RunDirectory, int]
 """A run that is open: its plan, folder and seed."""
 
@@ -82,7 +93,7 @@ def start_run(
     seed : int
         Of a goal that names none.
     tip_use : callable or None
-        How a sensor is used, by its name; see `prepare`.
+        See `prepare`.
     tell, check : callable
         Receives each touch; raises `Interrupted` where the goal is cancelled.
 
@@ -102,8 +113,7 @@ def start_run(
         tell(Progress(point, Phase.SURFACE, point.index, count))
         return hands.find(point, force_n, radius_m, check)
 
-    use = None if tip_use is None else lambda: tip_use(scene.sensor.name)
-    plan, found = prepare(wanted, radius_m, find, use)
+    plan, found = prepare(wanted, radius_m, find, tip_use)
     seed = goal.seed or seed
     facts = {
         **run_facts(plan, seed),
@@ -120,6 +130,78 @@ def start_run(
     places = plan.points if scene.adaptive else ()
     run = RunDirectory.create(path, text, plan.first_points, facts, needed, places)
     return plan, run, seed
+
+
+def prepare(
+    plan: Plan,
+    ball_radius_m: float,
+    find: Callable[[ScanPoint, float, int], Touch],
+    tip_use: Callable[[str], TipUse | None] | None,
+) -> tuple[Plan, dict[str, Any]]:
+    """Touch what the scene asks for, and leave out what is not clear, before and after normals are known.
+
+    Parameters
+    ----------
+    plan : Plan
+        As it was compiled: before anything was touched.
+    ball_radius_m : float
+    find : callable
+        Touches a point with a force, one of so many.
+    tip_use : callable or None
+        How the sensor of a name is used; it returns None where that is not to be had. None: nothing is moved.
+
+    Returns
+    -------
+    plan : Plan
+        To go by.
+    facts : dict
+        What the run keeps of surface and normals that were found.
+
+    Raises
+    ------
+    ValueError
+        Where a surface is not found, touches cannot be made, or no point is left.
+    """
+    scene = plan.scene
+    facts: dict[str, Any] = {}
+    heading_rad, surface = scene.sensor.heading_rad, scene.surface
+    if isinstance(surface, TouchRequest):
+        force_n, count = surface.force_n or scene.force_n, len(surface.points_m)
+        try:
+            found, touches = find_surface(
+                surface, ball_radius_m, heading_rad, lambda point: find(point, force_n, count)
+            )
+        except (ValueError, PointFailed, ScanEnded) as error:
+            raise ValueError(f"surface.touch: {error}") from error
+        facts["surface"], surface = found.as_json(touches), found
+        plan = make_plan(scene, surface)
+    use: TipUse | None = None
+    # of a plane contact control keeps the sensor clear itself
+    if tip_use is not None and not isinstance(surface, Plane):
+        use = tip_use(scene.sensor.name)
+        if use is None:
+            plan = replace(plan, left_out=(UNCHECKED, *plan.left_out))
+
+    def clear(plan: Plan) -> Plan:
+        return plan if use is None else plan.with_points(*clear_points(plan.points, surface, use))
+
+    plan = clear(plan)
+    asked = scene.normals
+    if asked is None:
+        return plan, facts
+    force_n, count = asked.force_n or scene.force_n, len(plan.points)
+    try:
+        points, normals, left = find_normals(
+            plan.points,
+            asked,
+            ball_radius_m,
+            heading_rad,
+            lambda point: find(point, force_n, count),
+        )
+    except (PointFailed, ScanEnded) as error:
+        raise ValueError(f"normals: {error}") from error
+    facts["normals"] = normals
+    return clear(plan.with_points(points, left)), facts
 
 
 def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:

@@ -18,20 +18,32 @@ from tactile_resonance.scan.decision import Decision, GateKeeper, Verdict, decid
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Check,
+    Controls,
     Disturbances,
     Hands,
     Interrupted,
     Measured,
+    Phase,
     PointDisturbed,
     PointFailed,
+    Progress,
+    Request,
     ScanEnded,
+    Summary,
 )
 from tactile_resonance.scan.plan import Plan
-from tactile_resonance.scan.point_outcome import air_point, attempt_at, measured_result
+from tactile_resonance.scan.point_outcome import (
+    AFTER,
+    BEFORE,
+    SILENT,
+    air_point,
+    attempt_at,
+    measured_result,
+    read_reference,
+    sensor_health,
+)
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.points import ScanPoint
-from tactile_resonance.scan.progress import Controls, Phase, Progress, Request, Summary
-from tactile_resonance.scan.references import AFTER, BEFORE, SILENT, read_reference, sensor_health
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory, ended_by_storage
 from tactile_resonance.scan.scene import OnFailure, Output
 from tactile_resonance.scan.tissue_tests import ProtocolRequest, fits_of, write_fits
@@ -121,9 +133,15 @@ class ScanRunner:
         return ""
 
     def _next(self) -> ScanPoint | None:
-        """The point to touch next; waits while the scan is paused or a node is away."""
+        """The point to touch next; waits while the scan is paused or a node is away.
+
+        The first that is not finished; an adaptive scan chooses and appends one where all are.
+        """
         self._wait()
-        point = self._known_next()
+        if (point := self._run.next_point) is None:
+            content = self._run.content
+            chosen = self._plan.next_point(content.points, content.latest)
+            point = None if chosen is None else self._run.append(chosen)
         request = self._controls.take()
         if request is Request.REPEAT and (content := self._run.content).results:
             latest = max(content.results, key=lambda result: result.time_ns)
@@ -134,14 +152,6 @@ class ScanRunner:
                 self._publish(recording.finish(result))
             return self._next()
         return point
-
-    def _known_next(self) -> ScanPoint | None:
-        """The first point that is not finished; an adaptive scan chooses and appends one where all are."""
-        if (point := self._run.next_point) is not None:
-            return point
-        content = self._run.content
-        chosen = self._plan.next_point(content.points, content.latest)
-        return None if chosen is None else self._run.append(chosen)
 
     def _wait(self) -> None:
         """With the tip free, while the scan is paused or a node is held, and until all are at work."""

@@ -7,6 +7,7 @@ bench reads (`tactile_resonance.simulation.tissue.scene`) and a scan does not ne
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
@@ -32,7 +33,6 @@ from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, PoleBand
 from tactile_resonance.scan.adaptive import Adaptive, read_adaptive
 from tactile_resonance.scan.clearance import is_plane
 from tactile_resonance.scan.decision import BlockLimits, Gate, Precise, Separate
-from tactile_resonance.scan.period import residual_terms_of
 from tactile_resonance.scan.points import flat, read_positions, require_near
 from tactile_resonance.scan.surface import NormalRequest, Plane, Surface, TouchRequest, read_surface
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
@@ -45,10 +45,12 @@ from tactile_resonance.tissue.references import parse_classes, parse_nominal_con
 BENCH_KEYS = {"regions", "buried", "motion"}
 AUTO = "auto"
 """What the plan chooses."""
-
-
 MOST_FORCE_N = 1.0
 """A hundred times the preload of the method: beyond it a figure is a slip of the unit."""
+NEIGHBOUR = 0.5
+"""Of the lower end of a band: other modes are expected from there downwards."""
+LEFT_OF_NEIGHBOURS = 1e-6
+"""Of the response of such a mode, what residual terms may leave."""
 
 
 class Output(str, Enum):
@@ -76,6 +78,18 @@ def _read_period(value: object, field: str) -> int | None:
     return cast(int, value)
 
 
+def residual_terms_of(ends_hz: tuple[float, float]) -> int:
+    """Residual terms that a band needs for modes beside it.
+
+    A polynomial of r terms follows the response of a pole beside a band up to ``rho^-r`` of it, rho the sum of
+    the half axes of the ellipse through the pole whose foci are the band's ends, over half the band's width
+    (Bernstein; Trefethen, Approximation Theory and Approximation Practice (2013), theorem 8.2).
+    """
+    low_hz, high_hz = ends_hz
+    away = (low_hz + high_hz - 2 * NEIGHBOUR * low_hz) / (high_hz - low_hz)
+    return math.ceil(-math.log(LEFT_OF_NEIGHBOURS) / math.acosh(away))
+
+
 @dataclass(frozen=True)
 class SensorUse:
     """The sensor and how it is used.
@@ -94,7 +108,7 @@ class SensorUse:
     sample_rate_hz : float
     samples_per_period : int or None
         Lines are multiples of their ratio; a block is one period. None (``auto``): the plan chooses it, see
-        `tactile_resonance.scan.period`.
+        `tactile_resonance.scan.measurement`.
     level_v : float
         Drive [V rms], if the sensor's whole range were excited: the amplitude of each line follows from
         it, however few are.
@@ -345,21 +359,21 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     keys = {item.name for item in fields(ScanScene)} - {"positions_m", "adaptive"} | {"positions"}
     known_keys(content, keys | BENCH_KEYS, where)
     content = with_library(content, path)
-    given: dict[str, Any] = {}
-    given["tissue_classes"], given["nominal_contact"] = _read_tissues(content, where)
+    nominal, named = parse_nominal_contact(content, where), content.get("tissue_classes")
+    accepted = "classes, to which nominal_contact belongs (they are missing)"
+    require(named is not None or nominal is None, f"{where} tissue_classes", named, accepted)
+    classes = () if named is None else parse_classes(named, f"{where} tissue_classes")
+    given: dict[str, Any] = {"tissue_classes": classes, "nominal_contact": nominal}
     positions = section(content, "positions", where)
     if "adaptive" in positions:
         require(len(positions) == 1, f"{where} positions", [*positions], "adaptive, or another one")
         asked = section(positions, "adaptive", f"{where} positions")
-        given["adaptive"] = read_adaptive(
-            asked, given["tissue_classes"], f"{where} positions.adaptive"
-        )
+        given["adaptive"] = read_adaptive(asked, classes, f"{where} positions.adaptive")
         given["positions_m"] = flat(given["adaptive"].places_m())
         require_near(given["positions_m"], f"{where} positions.adaptive")
     else:
         given["positions_m"] = read_positions(positions, f"{where} positions")
     if "precision" in content:
-        classes = given["tissue_classes"]
         given["precision"] = _read_precision(content["precision"], classes, f"{where} precision")
     if "surface" in content:
         surface = section(content, "surface", where)
@@ -372,19 +386,6 @@ def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     handled = {*given, "positions", *BENCH_KEYS}
     rest = {key: value for key, value in content.items() if key not in handled}
     return read_dataclass(ScanScene, {"name": path.stem, **rest}, where, **given)
-
-
-def _read_tissues(
-    content: Mapping[str, Any], where: str
-) -> tuple[tuple[TissueClass, ...], NominalContact | None]:
-    """Classes and the contact to which they refer."""
-    nominal = parse_nominal_contact(content, where)
-    classes = content.get("tissue_classes")
-    if classes is None:
-        accepted = "classes, to which nominal_contact belongs (they are missing)"
-        require(nominal is None, f"{where} tissue_classes", None, accepted)
-        return (), None
-    return parse_classes(classes, f"{where} tissue_classes"), nominal
 
 
 @dataclass(frozen=True)

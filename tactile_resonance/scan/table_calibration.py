@@ -147,7 +147,7 @@ def calibrate_table(
     ball_radius_m: float,
     touch: Callable[[ScanPoint], Touch],
 ) -> TableCalibration:
-    """Touch all points of a request and find the table.
+    """Touch all points of a request and find the table whose surface all balls touch.
 
     Parameters
     ----------
@@ -161,7 +161,8 @@ def calibrate_table(
     Raises
     ------
     ValueError
-        As `table_from_touches`.
+        If the touches do not determine the tilts or contradict a plane, or the table is tilted further than
+        accepted.
     PointFailed
         That `touch` raised, with the number of the touch.
     """
@@ -170,23 +171,6 @@ def calibrate_table(
         xy, "plane", request.height_m, request.force_n, math.inf, request.search_m
     )
     _, touches = find_surface(wanted, ball_radius_m, request.heading_rad, touch)
-    return table_from_touches(request, table_in_base, ball_radius_m, touches)
-
-
-def table_from_touches(
-    request: CalibrationRequest,
-    table_in_base: Pose,
-    ball_radius_m: float,
-    touches: Sequence[Touch],
-) -> TableCalibration:
-    """Table whose surface all balls touch.
-
-    Raises
-    ------
-    ValueError
-        If the touches do not determine the tilts or contradict a plane, or the table is tilted further than
-        accepted.
-    """
     wider = [replace(t, std_m=math.hypot(t.std_m, request.flatness_m)) for t in touches]
     surface = fit_touches(wider, "plane", ball_radius_m)
     covariance = _covariance(surface, request.height_m)

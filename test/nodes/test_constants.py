@@ -10,7 +10,7 @@ from tactile_resonance.action import Scan
 from tactile_resonance.msg import ContactState
 
 from tactile_resonance.contact.goal import State
-from tactile_resonance.scan.progress import Phase
+from tactile_resonance.scan.hands import Phase
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,9 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.recording.messages import write_indentation
 from tactile_resonance.scan.decision import BlockLimits, Precise
-from tactile_resonance.scan.hands import Measured, PointFailed
+from tactile_resonance.scan.hands import Controls, Measured, PointFailed
 from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.progress import Controls
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner

@@ -12,10 +12,9 @@ from scipy.spatial.distance import cdist
 
 from tactile_resonance.report.run_map import boundary_of_run
 from tactile_resonance.scan.adaptive import WantedMap
+from tactile_resonance.scan.hands import Controls, Request
 from tactile_resonance.scan.level_set import boundary_of, difference_m2
-from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.plan_text import plan_against_outcome, plan_rows
-from tactile_resonance.scan.progress import Controls, Request
+from tactile_resonance.scan.plan import make_plan, plan_against_outcome, plan_rows
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner

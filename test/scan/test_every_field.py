@@ -17,9 +17,8 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.run_report import pole_maps_of
 from tactile_resonance.scan.decision import BlockLimits, Precise
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal
-from tactile_resonance.scan.hands import Touch
-from tactile_resonance.scan.progress import Controls
-from tactile_resonance.scan.references import judge_drift
+from tactile_resonance.scan.hands import Controls, Touch
+from tactile_resonance.scan.point_outcome import judge_drift
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_start import start_run
 from tactile_resonance.scan.runner import ScanRunner

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from tactile_resonance.scan import run_directory
+from tactile_resonance.scan.hands import Controls
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_result import TYPE, from_message
 from tactile_resonance.scan.pole_map import GrowingMap
-from tactile_resonance.scan.progress import Controls
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner

@@ -19,9 +19,9 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.points import ScanPoint, tip_orientation
-from tactile_resonance.scan.preparation import find_normals, normal_of_touches, places_around
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.scan.surface import NormalRequest
+from tactile_resonance.scan.surface_search import find_normals, normal_of_touches, places_around
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.surfaces import RoundSurface
 from tactile_resonance.simulation.plant.tip import Tip

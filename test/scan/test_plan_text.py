@@ -13,8 +13,7 @@ from tactile_resonance.cli import main
 from tactile_resonance.configuration import share_path
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Precise, Verdict, decide
-from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.plan_text import plan_against_outcome, plan_rows
+from tactile_resonance.scan.plan import make_plan, plan_against_outcome, plan_rows
 from tactile_resonance.scan.scene import Output, TimeLimits, read_run_scene, read_scan_scene
 from tactile_resonance.scan.surface import NormalRequest, TouchRequest
 from tactile_resonance.tissue.nominal_contact import ContactLoad

@@ -89,10 +89,11 @@ def test_how_the_force_moved_stands_in_the_result():
     assert row.split(",")[at : at + 3] == ["0.0003", "0.009", "0.011"]
 
 
-def map_point(poles, origin, *classes, **given):
+def map_point(poles, origin, *classes, age_s=np.nan, **given):
     """Point of poles that belong to no scan: where the tip was is its place."""
     x_m, y_m, z_m = origin.contact.position_m or (np.nan,) * 3
-    result = PointResult(0, x_m=x_m, y_m=y_m, z_m=z_m, reason=poles.message)
+    place = {"x_m": x_m, "y_m": y_m, "z_m": z_m}
+    result = PointResult(0, **place, reason=poles.message, contact_age_s=age_s)
     return MapPoint.of_tip(with_poles(result, poles, origin, *classes, **given), origin)
 
 

@@ -20,11 +20,11 @@ from tactile_resonance.report.run_report import pole_maps_of
 from tactile_resonance.report.run_report import summary as sentences
 from tactile_resonance.report.run_tables import point_table
 from tactile_resonance.scan.decision import Separate
+from tactile_resonance.scan.hands import Controls, Request
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import read_messages
+from tactile_resonance.scan.point_outcome import SensorHealth
 from tactile_resonance.scan.point_result import TYPE, PointOutcome
-from tactile_resonance.scan.progress import Controls, Request
-from tactile_resonance.scan.references import SensorHealth
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
@@ -296,7 +296,7 @@ SCANS = """
     import bench_hands as t
     from tactile_resonance.scan.plan import make_plan
     from tactile_resonance.scan.run_directory import RunDirectory
-    from tactile_resonance.scan.progress import Controls
+    from tactile_resonance.scan.hands import Controls
     from tactile_resonance.scan.runner import ScanRunner
     path, made = Path(sys.argv[1]), t.scene(8)
     def scan():

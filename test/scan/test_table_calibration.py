@@ -25,7 +25,6 @@ from tactile_resonance.scan.table_calibration import (
     as_text,
     calibrate_table,
     read_table,
-    table_from_touches,
 )
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
@@ -59,6 +58,10 @@ def ball_on(true, known, xy, top_m=0.0):
 
 def touches_on(true, known, xys, top_m=0.0, std_m=2e-5):
     return [Touch(ball_on(true, known, xy, top_m), std_m, 0.01) for xy in xys]
+
+
+def table_from_touches(request, known, radius_m, touches):
+    return calibrate_table(request, known, radius_m, lambda point: touches[point.index])
 
 
 def angle_between(first, second):

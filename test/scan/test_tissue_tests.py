@@ -17,8 +17,7 @@ from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal
 from tactile_resonance.scan.hands import ATTEMPTS, PointDisturbed, PointFailed
-from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.plan_text import plan_rows
+from tactile_resonance.scan.plan import make_plan, plan_rows
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_start import new_run, start_run

@@ -9,7 +9,7 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.scan.clearance import TipUse
 from tactile_resonance.scan.hands import PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.preparation import UNCHECKED, prepare
+from tactile_resonance.scan.run_start import UNCHECKED, prepare
 from tactile_resonance.scan.scene import ScanScene
 from tactile_resonance.scan.surface import HeightField, NormalRequest, Plane, TouchRequest
 
@@ -41,7 +41,7 @@ def finding(slope=(0.0, 0.0), touched=None, bad=()):
     return find
 
 
-def use():
+def use(_):
     return USE
 
 
@@ -81,7 +81,7 @@ def test_what_is_not_looked_at_is_noted(surface):
     scene = scene_of(surface)
     plan = make_plan(scene)
     assert prepare(plan, RADIUS_M, finding(), None)[0] == plan  # nothing is moved
-    noted, _ = prepare(plan, RADIUS_M, finding(), lambda: None)
+    noted, _ = prepare(plan, RADIUS_M, finding(), lambda _: None)
     assert (UNCHECKED in noted.skipped) is (surface is BANK)
     assert noted.points == plan.points
 

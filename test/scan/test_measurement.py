@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The period that a plan chooses: lines enough for the model, no more, and away from the mains."""
+"""The period that a plan chooses: lines enough, no more, away from the mains; that of a calibrated sensor."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,20 +14,26 @@ from tactile_resonance.contact.force_spread import spread_of
 from tactile_resonance.multisine import Grid
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Precise, Separate
-from tactile_resonance.scan.measurement import design_measurement, excitation_of
-from tactile_resonance.scan.period import (
+from tactile_resonance.scan.measurement import (
     LEAST_DISTANCE,
     LONGER,
+    design_measurement,
+    excitation_of,
     lines_of,
     lines_wanted,
     mains_distances,
     mains_in,
-    residual_terms_of,
     shortest_samples,
 )
-from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.plan_text import plan_rows
-from tactile_resonance.scan.scene import Gate, Output, parse_scan_scene, read_scan_scene
+from tactile_resonance.scan.plan import make_plan, plan_rows
+from tactile_resonance.scan.scene import (
+    Gate,
+    Output,
+    parse_scan_scene,
+    read_scan_scene,
+    residual_terms_of,
+)
+from tactile_resonance.strict_yaml import parse_yaml
 
 SCENE = share_path("config/scenes/two_gelatines.yaml")
 
@@ -195,3 +202,59 @@ def test_what_cannot_be_chosen_is_refused(sensor, reason):
     content = {"force_n": 0.01, "positions": {"list": [[0, 0]]}, "sensor": sensor}
     with pytest.raises(ValueError, match=reason):
         parse_scan_scene(content, SCENE)
+
+
+def scene(**changes):
+    content = parse_yaml(SCENE.read_text(encoding="utf-8"))
+    content["sensor"] |= {"calibrated": True} | changes.pop("sensor", {})
+    return parse_scan_scene(content | changes, Path("changed.yaml"))
+
+
+def test_blocks_are_of_20_ms_and_one_may_do():
+    design = design_measurement(scene())
+    assert design.block_s == pytest.approx(0.02)
+    assert design.blocks.least == 1
+    assert design.sweep
+    assert design.stretches_hz == ((200.0, 620.0),)  # all lines lie in the band
+    assert design.lines == 9
+
+
+def test_each_line_is_as_high_as_without_a_calibration():
+    short, usual = design_measurement(scene()), design_measurement(scene(sensor={"calibrated": False}))
+    power = [design.level_v**2 / design.lines * design.block_s for design in (short, usual)]
+    # of all lines at once, whose number goes as the period
+    assert power[0] / power[1] == pytest.approx(1.0, rel=0.02)
+
+
+def test_a_reference_in_air_is_as_without_a_calibration():
+    short, usual = design_measurement(scene()), design_measurement(scene(sensor={"calibrated": False}))
+    assert short.of_reference == usual.of_reference
+
+
+def test_a_period_of_the_scene_s_own_is_kept():
+    design = design_measurement(scene(sensor={"samples_per_period": 600}))
+    assert design.block_s == pytest.approx(0.012)
+    assert design.of_reference.samples > 2000
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"outputs": ["poles", "distortion"]}, "outputs: got"),
+        (
+            {"sensor": {"further_bands": [{"low_hz": 650.0, "high_hz": 800.0}]}},
+            "sensor.further_bands",
+        ),
+        ({"gate": {"force_rms_n": 1e-3}}, "gate: got"),
+        ({"sensor": {"samples_per_period": 300}}, r"sensor: got \d+ excited lines in the band"),
+    ],
+)
+def test_what_short_blocks_do_not_hold_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        design_measurement(scene(**changes))
+
+
+def test_the_plan_says_so():
+    rows = dict(plan_rows(make_plan(scene())))
+    assert "calibration of poles_node" in rows["sensor"]
+    assert "transient is known" in rows["period"]
