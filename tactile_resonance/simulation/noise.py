@@ -48,6 +48,15 @@ class Jitter:
     """Stationary vibration of three axes: white noise through two equal real poles, seeded.
 
     Its autocorrelation is ``s^2 (1 + w |t|) exp(-w |t|)``; the step is exact for any period.
+
+    Parameters
+    ----------
+    rms_m : float
+        s, of each axis [m].
+    corner_rad_s : float
+        w, the rate of the poles [rad/s].
+    period_s : float
+    seed : Seed
     """
 
     def __init__(self, rms_m: float, corner_rad_s: float, period_s: float, seed: Seed) -> None:
