@@ -180,6 +180,7 @@ class Transducer:
     Attributes
     ----------
     faults : CellFaults
+        Its fields may be set at any time.
     """
 
     def __init__(self, parameters: CellParameters, seed: Seed = 1) -> None:
@@ -267,26 +268,16 @@ COMMAND_ID, RESPONSE_IDS = 0x64, (0x001, 0x002)
 """Identifiers of the frames that it takes, and of those that it sends."""
 
 
-class LoadCell:
-    """The cell, moved by whoever steps it.
-
-    Parameters
-    ----------
-    parameters : CellParameters
-    seed : int
-        Of its noise.
+class LoadCell(Transducer):
+    """The cell on its bus, moved by whoever steps it.
 
     Attributes
     ----------
-    faults : CellFaults
-        Its fields may be set at any time.
     streaming : bool
     """
 
     def __init__(self, parameters: CellParameters, seed: Seed = 1) -> None:
-        self._transducer = Transducer(parameters, seed)
-        self.faults = self._transducer.faults
-        self._model = parameters.name
+        super().__init__(parameters, seed)
         self._next_ids = (COMMAND_ID, *RESPONSE_IDS)
         self.streaming = False
         self._rate_code = self._filter_code = 0
@@ -296,10 +287,6 @@ class LoadCell:
         self._wrench: tuple[float, ...] = (0.0,) * 6
         self._counts: tuple[int, ...] = (0,) * 6
         self._bits = 0
-
-    def reseed(self, seed: Seed) -> None:
-        """Take all noise from the next conversion on from a seed, whatever was drawn before."""
-        self._transducer.reseed(seed)
 
     def step(self, wrench: Iterable[float], time_s: float) -> list[CanFrame]:
         """Advance to a time of the plant, at which `wrench`, 6 [N, N m], acts on the cell.
@@ -319,7 +306,7 @@ class LoadCell:
         while self._time_s + SAMPLE_PERIOD_S <= time_s + 1e-9:
             self._time_s += SAMPLE_PERIOD_S
             part = (self._time_s - start_s) / span_s
-            self._counts, self._bits = self._transducer.convert(load, before, part)
+            self._counts, self._bits = self.convert(load, before, part)
             self._ticks += 1
             if self.streaming and self._ticks % self._decimation == 0:
                 frames += self._wrench_frames(START)
@@ -345,7 +332,7 @@ class LoadCell:
             self.streaming = False
             return []
         if command == SET_BIAS:
-            self._transducer.set_zero(bool(parameters[0]))
+            self.set_zero(bool(parameters[0]))
             return []
         if command == READ_ONCE:
             return self._wrench_frames(READ_ONCE)
@@ -354,7 +341,7 @@ class LoadCell:
     def _answer(self, command: int, parameters: list[int]) -> bytes:
         """D2 onwards."""
         if command in (READ_MODEL, READ_SERIAL, READ_FIRMWARE):
-            texts = {READ_MODEL: self._model, READ_SERIAL: "SIMULATED", READ_FIRMWARE: "1.7"}
+            texts = {READ_MODEL: self.parameters.name, READ_SERIAL: "SIMULATED", READ_FIRMWARE: "1.7"}
             return texts[command].encode("ascii", "replace")[:15]
         if command == SET_IDS:
             good = all(0 < i < 0x100 for i in parameters[:3]) and len(set(parameters[:3])) == 3
@@ -368,7 +355,7 @@ class LoadCell:
             good = kind in (0, 1) and code < len(FILTERS_HZ)
             if good:
                 self._filter_code = code if kind else 0
-                self._transducer.set_low_pass(FILTERS_HZ[self._filter_code])
+                self.set_low_pass(FILTERS_HZ[self._filter_code])
             return _result(good)
         if command == READ_FILTER:
             return bytes([1 if self._filter_code else 0, self._filter_code])
@@ -381,7 +368,7 @@ class LoadCell:
         if command == READ_RATE:
             return bytes([self._rate_code])
         if command == READ_OVERLOADS:
-            return bytes(min(255, count) for count in self._transducer.overload_counts)
+            return bytes(min(255, count) for count in self.overload_counts)
         return bytes([0, UNSUPPORTED])
 
     def _wrench_frames(self, command: int) -> list[CanFrame]:

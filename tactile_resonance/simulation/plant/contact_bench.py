@@ -90,9 +90,13 @@ class TipMotion:
         self._set_twist = self._limited(self._wanted)
         last = self.twist
         self.twist = np.array(self._lag.step(self._set_twist.tolist()))
-        self.reported = _moved(self.reported, (last + self.twist) / 2 * dt)
-        place = self.reported.position_m + self._jitter.step()
-        self.pose = Pose(place, self.reported.rotation_rad)
+        way = (last + self.twist) / 2 * dt
+        # the same object where nothing turns, so that what is computed from it can be kept
+        rotation = self.reported.rotation_rad
+        if way[3] or way[4] or way[5]:
+            rotation = (Rotation.from_rotvec(way[3:]) * self.reported.rotation).as_rotvec()
+        self.reported = Pose(self.reported.position_m + way[:3], rotation)
+        self.pose = Pose(self.reported.position_m + self._jitter.step(), rotation)
 
     def _limited(self, wanted: FloatArray) -> FloatArray:
         change = wanted - self._set_twist
@@ -103,18 +107,6 @@ class TipMotion:
         if largest <= step:
             return wanted
         return self._set_twist + change * (step / largest)
-
-
-def _moved(pose: Pose, step: FloatArray) -> Pose:
-    """Return a pose after a small motion (6,) [m, rad] in the base.
-
-    The rotation vector stays the same object where nothing turns, so that what is computed from it
-    can be kept.
-    """
-    rotation = pose.rotation_rad
-    if step[3] or step[4] or step[5]:
-        rotation = (Rotation.from_rotvec(step[3:]) * pose.rotation).as_rotvec()
-    return Pose(pose.position_m + step[:3], rotation)
 
 
 class VirtualBench(Clock):

@@ -88,8 +88,8 @@ class Safety:
     """
 
     def __init__(self) -> None:
-        self.robot_mode = RobotMode.RUNNING
-        self.safety_mode = SafetyMode.NORMAL
+        self.robot_mode: RobotMode = RobotMode.RUNNING
+        self.safety_mode: SafetyMode = SafetyMode.NORMAL
         self._time_s = 0.0
         self._next_mode: RobotMode | None = None
         self._due_s = 0.0

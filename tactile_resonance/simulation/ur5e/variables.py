@@ -131,6 +131,15 @@ def _joint_mode(robot: UrController) -> list[int]:
 
 Reader = Callable[["UrController"], tuple[float, ...] | OutputValue]
 
+
+def _integer(number: int) -> Reader:
+    return lambda robot: robot.registers.output_int[number]
+
+
+def _double(number: int) -> Reader:
+    return lambda robot: robot.registers.output_double[number]
+
+
 # RTDE type of each output, and what reads it.
 OUTPUTS: dict[str, tuple[str, Reader]] = {
     "timestamp": ("DOUBLE", lambda robot: robot.time_s + robot.stood_still_s),
@@ -190,12 +199,6 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
         ("output_bit_registers0_to_31", "output_bit_registers32_to_63"),
         ("UINT32", lambda robot: 0),
     ),
-    **{
-        f"output_int_register_{n}": ("INT32", lambda robot, n=n: robot.registers.output_int[n])
-        for n in range(REGISTER_COUNT)
-    },
-    **{
-        f"output_double_register_{n}": ("DOUBLE", lambda robot, n=n: robot.registers.output_double[n])
-        for n in range(REGISTER_COUNT)
-    },
+    **{f"output_int_register_{n}": ("INT32", _integer(n)) for n in range(REGISTER_COUNT)},
+    **{f"output_double_register_{n}": ("DOUBLE", _double(n)) for n in range(REGISTER_COUNT)},
 }

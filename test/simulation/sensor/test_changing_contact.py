@@ -11,9 +11,14 @@ from tactile_resonance.simulation.sensor.bench import (
     BenchEffects,
     BenchTip,
     ContactSoFar,
+)
+from tactile_resonance.simulation.sensor.bimorph import (
+    INTERVAL_S,
+    VaryingStream,
+    couple,
+    parts_of,
     pole_trajectory,
 )
-from tactile_resonance.simulation.sensor.bimorph import INTERVAL_S, VaryingStream, couple, parts_of
 from tactile_resonance.simulation.sensor.response import Lines, ResponseStream
 from tactile_resonance.simulation.tissue.indenter import Indenter, indent
 
