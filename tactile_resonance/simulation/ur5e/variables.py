@@ -28,16 +28,15 @@ INT_INPUTS = tuple(f"input_int_register_{n}" for n in range(REGISTER_COUNT))
 DOUBLE_INPUTS = tuple(f"input_double_register_{n}" for n in range(REGISTER_COUNT))
 _REGISTERS = frozenset({*INT_INPUTS, *DOUBLE_INPUTS})
 
+# Groups of digital outputs and their first bit in the word of all.
+_DIGITAL = {"standard": 0, "configurable": 8, "tool": 16}
+
 # Types of all inputs, as the RTDE guide names them.
 INPUT_TYPES: dict[str, str] = {
     "speed_slider_mask": "UINT32",
     "speed_slider_fraction": "DOUBLE",
-    "standard_digital_output_mask": "UINT8",
-    "standard_digital_output": "UINT8",
-    "configurable_digital_output_mask": "UINT8",
-    "configurable_digital_output": "UINT8",
-    "tool_digital_output_mask": "UINT8",
-    "tool_digital_output": "UINT8",
+    **dict.fromkeys((f"{group}_digital_output_mask" for group in _DIGITAL), "UINT8"),
+    **dict.fromkeys((f"{group}_digital_output" for group in _DIGITAL), "UINT8"),
     "standard_analog_output_mask": "UINT8",
     "standard_analog_output_type": "UINT8",
     "standard_analog_output_0": "DOUBLE",
@@ -46,9 +45,6 @@ INPUT_TYPES: dict[str, str] = {
     **dict.fromkeys(INT_INPUTS, "INT32"),
     **dict.fromkeys(DOUBLE_INPUTS, "DOUBLE"),
 }
-
-# Groups of digital outputs and their first bit in the word of all.
-_DIGITAL = {"standard": 0, "configurable": 8, "tool": 16}
 
 InputValue = float | int | Sequence[float]
 
