@@ -27,12 +27,7 @@ from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.tip_force import Mounting, TipForce
 from tactile_resonance.contact.vectors import six, vector
-from tactile_resonance.simulation.cell.transducer import (
-    NO_NUMBER,
-    CellFaults,
-    CellParameters,
-    Transducer,
-)
+from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
 from tactile_resonance.simulation.noise import Jitter
 from tactile_resonance.simulation.plant.plant import CellMounting, Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
@@ -263,7 +258,7 @@ class VirtualArm:
             raise ArmError(fault, f"simulated fault: {fault.value}")
 
 
-class VirtualCell:
+class VirtualCell(Transducer):
     """A `Cell` on the bench: one wrench per period of the robot.
 
     With `TipForce` around it, it is a `ForceSource`.
@@ -289,14 +284,11 @@ class VirtualCell:
         parameters: CellParameters | None = None,
         seed: int = 0,
     ) -> None:
+        p = CellParameters.from_yaml() if parameters is None else parameters
+        super().__init__(p, seed)
         self.error: ForceFault | None = None
         self._bench = bench
-        self._parameters = CellParameters.from_yaml() if parameters is None else parameters
-        self._transducer = Transducer(self._parameters, seed)
-        self.faults: CellFaults = self._transducer.faults
-        self._scale = np.repeat(
-            [1 / self._parameters.force_divisor, 1 / self._parameters.torque_divisor], 3
-        )
+        self._scale = np.repeat([1 / p.force_divisor, 1 / p.torque_divisor], 3)
         self._waiting: list[CellSample] = []
         self._count = 0
         bench.on_step.append(self._measure)
@@ -304,7 +296,7 @@ class VirtualCell:
     @property
     def info(self) -> ForceInfo:
         """What it can do."""
-        p = self._parameters
+        p = self.parameters
         return ForceInfo(
             name=p.name,
             rate_hz=1 / self._bench.motion.period_s,
@@ -337,7 +329,7 @@ class VirtualCell:
 
     def _measure(self) -> None:
         force_n, torque_nm = self._bench.plant.wrench_at_cell()
-        counts, bits = self._transducer.convert((*force_n, *torque_nm))
+        counts, bits = self.convert((*force_n, *torque_nm))
         self._count += 1
         every = self.faults.lose_second_every
         if self.faults.silent or (every and self._count % every == 0):

@@ -27,7 +27,6 @@ from tactile_resonance.simulation.ur5e.controller import (
     POLYSCOPE,
     SERIAL_NUMBER,
     RefusedError,
-    RuntimeState,
     UrController,
 )
 from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService, Reactor
@@ -52,8 +51,8 @@ class DashboardService(MessageService):
             "robotmode": lambda: f"Robotmode: {c.safety.robot_mode.name}",
             "safetymode": lambda: f"Safetymode: {c.safety.safety_mode.name}",
             "safetystatus": lambda: f"Safetystatus: {c.safety.safety_mode.name}",
-            "programState": lambda: f"{'PLAYING' if self._running() else 'STOPPED'} rtde_control",
-            "running": lambda: f"Program running: {str(self._running()).lower()}",
+            "programState": lambda: f"{'PLAYING' if c.program else 'STOPPED'} rtde_control",
+            "running": lambda: f"Program running: {str(c.program is not None).lower()}",
             "is in remote control": lambda: str(c.remote_control).lower(),
             "isProgramSaved": lambda: "true",
             "get loaded program": lambda: "No program loaded",
@@ -112,9 +111,6 @@ class DashboardService(MessageService):
         if request in ("play", "pause"):
             return f"Failed to execute: {request}"
         return f"could not understand: '{request}'"
-
-    def _running(self) -> bool:
-        return self._controller.runtime_state is RuntimeState.PLAYING
 
 
 class ControlService(MessageService):

@@ -26,7 +26,6 @@ from tactile_resonance.simulation.ur5e.poses import largest
 from tactile_resonance.simulation.ur5e.program import Program, register_offset
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError
 from tactile_resonance.simulation.ur5e.variables import (
-    INPUT_TYPES,
     INT_INPUTS,
     LARGEST_FIGURE,
     OUTPUTS,
@@ -258,18 +257,10 @@ class UrController:
         return self.machine.rests and self.runtime_state is not RuntimeState.STOPPING
 
     def write_inputs(self, values: Mapping[str, InputValue]) -> None:
-        """Take one package of RTDE inputs, by name.
+        """Take one package of RTDE inputs, by name; raises as `Registers.write`.
 
         The way to write registers: a watchdog counts what is written here, whatever the value.
-
-        Raises
-        ------
-        KeyError
-            Where an input is not known; nothing is written then.
         """
-        if not INPUT_TYPES.keys() >= values.keys():
-            unknown = next(name for name in values if name not in INPUT_TYPES)
-            raise KeyError(f"RTDE input {unknown!r}: not known")
         self.registers.write(values)
         if "external_force_torque" in values:
             wrench = np.array(values["external_force_torque"], dtype=float).tolist()

@@ -80,9 +80,17 @@ class Registers:
         self.speed_slider = 1.0
 
     def write(self, values: Mapping[str, InputValue]) -> None:
-        """Take the inputs of one package; of outputs and slider only what its masks select is written."""
+        """Take the inputs of one package; of outputs and slider only what its masks select is written.
+
+        Raises
+        ------
+        KeyError
+            Where an input is not known; nothing is written then.
+        """
         own = values
         if not _REGISTERS.issuperset(values):
+            if unknown := [name for name in values if name not in INPUT_TYPES]:
+                raise KeyError(f"RTDE input {unknown[0]!r}: not known")
             own = {name: value for name, value in values.items() if name in _REGISTERS}
             self._write_ports(values)
         self.inputs.update(own)  # type: ignore[arg-type]
