@@ -23,11 +23,11 @@ from tactile_resonance.report.live import LiveServer
 from tactile_resonance.simulation.cell.tcp_bus import SlcanServer, SocketcandServer
 from tactile_resonance.simulation.plant.simulated_robot import (
     ControlService,
+    DashboardService,
     ScriptService,
     SimulatedRobot,
 )
 from tactile_resonance.simulation.ur5e.controller import UrController
-from tactile_resonance.simulation.ur5e.dashboard import DashboardService
 from tactile_resonance.simulation.ur5e.reactor import Service
 
 GREETINGS = {b"V": b"\1", b"S": b"\1"}

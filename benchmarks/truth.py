@@ -33,8 +33,7 @@ from tactile_resonance.poles.result import (
 )
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.simulation.sensor.bench import DEFAULT_EFFECTS, BenchRun, SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
-from tactile_resonance.simulation.sensor.changing_contact import pole_trajectory
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, pole_trajectory
 from tactile_resonance.simulation.sensor.response import Lines
 from tactile_resonance.simulation.tissue.library import read_tissues
 

@@ -23,8 +23,8 @@ FITS = tuple(
     f"tactile_resonance/{name}.py"
     for name in (
         *("poles/likelihood", "mechanics/course", "contact/contact_filter"),
-        *("simulation/cell/transducer", "simulation/tissue/indenter"),
-        *(f"simulation/ur5e/{name}" for name in ("forces", "kinematics", "poses", "tracking")),
+        *("simulation/cell/transducer", "simulation/noise", "simulation/tissue/indenter"),
+        *(f"simulation/ur5e/{name}" for name in ("forces", "kinematics", "poses")),
     )
 )
 

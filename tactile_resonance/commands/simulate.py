@@ -17,14 +17,13 @@ from tactile_resonance.commands.options import add_file
 from tactile_resonance.contact.vectors import six
 from tactile_resonance.fields import number, require
 from tactile_resonance.processes import take_priority
-from tactile_resonance.simulation.cell.load_cell import LoadCell
 from tactile_resonance.simulation.cell.tcp_bus import (
     Receiver,
     SlcanServer,
     SocketcandServer,
     TcpBus,
 )
-from tactile_resonance.simulation.cell.transducer import SAMPLE_PERIOD_S, CellParameters
+from tactile_resonance.simulation.cell.transducer import SAMPLE_PERIOD_S, CellParameters, LoadCell
 from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.plant.defaults import CAN_PORT, READY, TABLE_IN_BASE
 from tactile_resonance.simulation.ur5e.reactor import Reactor

@@ -33,8 +33,13 @@ from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import excitation_from_message
 from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
-from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactSoFar
+from tactile_resonance.simulation.sensor.bench import (
+    BenchEffects,
+    BenchRun,
+    BenchTip,
+    ContactSoFar,
+    SimulatedBench,
+)
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.simulation.ur5e.reactor import Reactor

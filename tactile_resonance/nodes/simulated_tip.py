@@ -44,9 +44,8 @@ from tactile_resonance.recording.messages import (
 )
 from tactile_resonance.simulation.plant.defaults import PRIORITY, READY, order
 from tactile_resonance.simulation.plant.surfaces import LaidScene
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.bench import BenchTip, ContactState, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, parts_of
-from tactile_resonance.simulation.sensor.changing_contact import BenchTip, ContactState
 from tactile_resonance.simulation.tissue.scene import PhantomScene
 from tactile_resonance.srv import ForceOver
 from tactile_resonance.srv import Truth as TruthService

@@ -13,9 +13,8 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.cantilever import mode_shape
 from tactile_resonance.report.drawing import SIMULATED, new_figure
 from tactile_resonance.simulation.plant.tip import SprungIndenter
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import sensor_modes
-from tactile_resonance.simulation.sensor.changing_contact import BenchTip, pole_trajectory
+from tactile_resonance.simulation.sensor.bench import BenchTip, SimulatedBench
+from tactile_resonance.simulation.sensor.bimorph import pole_trajectory, sensor_modes
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter, indent

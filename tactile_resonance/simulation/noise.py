@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seeded random numbers for what is stepped a thousand times a second."""
+"""Seeded noise for what is stepped a thousand times a second: independent numbers, and vibration."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import float64, njit
+from numba.types import UniTuple
 
 from tactile_resonance._typing import FloatArray
 
@@ -39,3 +42,53 @@ class NormalRows:
             numbers = self._rms * self._random.standard_normal((ROWS, self._rms.size))
             self._left = [*reversed(numbers)]
         return self._left.pop()
+
+
+class Jitter:
+    """Stationary vibration of three axes: white noise through two equal real poles, seeded.
+
+    Its autocorrelation is ``s^2 (1 + w |t|) exp(-w |t|)``; the step is exact for any period.
+
+    Parameters
+    ----------
+    rms_m : float
+        s, of each axis [m].
+    corner_rad_s : float
+        w, the rate of the poles [rad/s].
+    period_s : float
+    seed : Seed
+    """
+
+    def __init__(self, rms_m: float, corner_rad_s: float, period_s: float, seed: Seed) -> None:
+        rms, w, t = rms_m, corner_rad_s, period_s
+        fall = math.exp(-w * t)
+        transition = fall * np.array([[1 + w * t, t], [-(w**2) * t, 1 - w * t]])
+        stationary = rms**2 * np.diag([1.0, w**2])
+        driven = stationary - transition @ stationary @ transition.T
+        # tiny negative eigenvalues are rounding
+        values, vectors = np.linalg.eigh(driven)
+        drive = vectors * np.sqrt(np.maximum(values, 0))
+        self._rms = np.array([rms, rms * w])  # of place and speed
+        self._by = np.ascontiguousarray(np.hstack([transition, drive]))
+        self.reseed(seed)
+
+    def reseed(self, seed: Seed) -> None:
+        """Let vibration follow from a seed, from the next step on, beginning in a state drawn anew."""
+        random = np.random.default_rng(seed)
+        self._state = self._rms[:, None] * random.standard_normal((2, 3))  # places and speeds
+        self._rows = NormalRows(random, [1.0] * 6)
+
+    def step(self) -> tuple[float, float, float]:
+        """Advance one period; return the displacement [m]."""
+        return _tremble(self._state, self._by, self._rows.take())
+
+
+@njit(UniTuple(float64, 3)(float64[:, ::1], float64[:, ::1], float64[::1]), cache=True)
+def _tremble(state, by, noise):
+    """Advance place and speed of three axes; return the place."""
+    for k in range(3):
+        place, speed, first, second = state[0, k], state[1, k], noise[k], noise[3 + k]
+        for n in range(2):
+            a, b, c, d = by[n, 0], by[n, 1], by[n, 2], by[n, 3]
+            state[n, k] = a * place + b * speed + c * first + d * second
+    return state[0, 0], state[0, 1], state[0, 2]

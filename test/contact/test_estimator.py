@@ -18,8 +18,8 @@ from tactile_resonance.contact.law import force_speed
 from tactile_resonance.contact.observer import ArmModel
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.plant.tip_motion import TipMotion
-from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
+from tactile_resonance.simulation.plant.contact_bench import TipMotion
+from tactile_resonance.simulation.ur5e.machine import TrackingParameters
 
 NOISE_N, DT = 1e-3, 0.002
 

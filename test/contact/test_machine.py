@@ -23,7 +23,7 @@ from tactile_resonance.contact.result import Cause, NotIdleError
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.plant.contact_bench import DISH_KG
-from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
+from tactile_resonance.simulation.ur5e.machine import TrackingParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT, contact, lower, started, stiffer

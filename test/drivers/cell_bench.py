@@ -7,9 +7,8 @@ from pathlib import Path
 
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.simulation.cell.load_cell import LoadCell
 from tactile_resonance.simulation.cell.tcp_bus import SocketcandServer
-from tactile_resonance.simulation.cell.transducer import SAMPLE_PERIOD_S, CellParameters
+from tactile_resonance.simulation.cell.transducer import SAMPLE_PERIOD_S, CellParameters, LoadCell
 from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.ur5e.reactor import Reactor
 

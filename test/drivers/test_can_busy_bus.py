@@ -16,8 +16,7 @@ can = pytest.importorskip("can", reason="python-can is not installed")
 
 from tactile_resonance.drivers import can_bus  # noqa: E402
 from tactile_resonance.drivers.can_wrench import CanWrench  # noqa: E402
-from tactile_resonance.simulation.cell.load_cell import LoadCell  # noqa: E402
-from tactile_resonance.simulation.cell.transducer import CellParameters  # noqa: E402
+from tactile_resonance.simulation.cell.transducer import CellParameters, LoadCell  # noqa: E402
 
 PATIENCE_S = 60.0
 FOREIGN = (

@@ -35,8 +35,7 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.plant.surfaces import LaidScene
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.changing_contact import BenchTip
+from tactile_resonance.simulation.sensor.bench import BenchTip, SimulatedBench
 
 SECOND_NS = 10**9
 WITHIN_S = 60.0

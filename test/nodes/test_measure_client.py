@@ -26,7 +26,7 @@ from tactile_resonance.scan.point_result import POLES_TYPE, PointResult
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_content import file_of
 from tactile_resonance.scan.run_directory import RunDirectory
-from tactile_resonance.simulation.sensor.changing_contact import BenchTip
+from tactile_resonance.simulation.sensor.bench import BenchTip
 from test.spinning import spin_until
 
 KEY, TRUTHS = 7, 12

@@ -12,8 +12,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance.nodes.simulated_tip import truth_message
-from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.changing_contact import BenchTip
+from tactile_resonance.simulation.sensor.bench import BenchTip, SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 

@@ -16,7 +16,7 @@ from binascii import hexlify
 from collections.abc import Callable, Iterable
 from typing import ClassVar
 
-from tactile_resonance.simulation.cell.load_cell import CanFrame
+from tactile_resonance.simulation.cell.transducer import CanFrame
 from tactile_resonance.simulation.plant.bench_time import STALL_S
 from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService, Reactor
 

@@ -7,10 +7,13 @@ compute. Arm and cell have every fault of real ones.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from tactile_resonance._typing import FloatArray
 from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.interfaces import (
     ArmError,
@@ -24,20 +27,17 @@ from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.tip_force import Mounting, TipForce
 from tactile_resonance.contact.vectors import six, vector
-from tactile_resonance.simulation.cell.transducer import (
-    NO_NUMBER,
-    CellFaults,
-    CellParameters,
-    Transducer,
-)
+from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
+from tactile_resonance.simulation.noise import Jitter
 from tactile_resonance.simulation.plant.plant import CellMounting, Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.plant.tip_motion import TipMotion
 from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
-from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
 
+ROTATION_LEVER_M = 0.1
+"""Lever that turns the acceleration limit [m/s2] into one of rotation [rad/s2]."""
 PROTECTIVE_DECELERATION_M_S2 = 2.0
 """With which the robot brakes without a command (chosen)."""
 WATCHDOG_NS = 40_000_000
@@ -46,6 +46,62 @@ STALE_NS = 20_000_000
 """States older than this are refused."""
 CELL_DELAY_NS = 1_000_000
 """From a measurement of the cell to its arrival."""
+
+
+class TipMotion:
+    """Six axes of a tip that obeys twists, one period at a time.
+
+    Attributes
+    ----------
+    pose : Pose
+        Where the tip is, vibration included.
+    reported : Pose
+        What the arm's encoders say: without vibration.
+    twist : (6,) array
+        Velocity [m/s] and angular velocity [rad/s] of `reported`.
+    """
+
+    def __init__(
+        self, parameters: TrackingParameters, start: Pose, *, period_s: float = 0.002, seed: int = 0
+    ) -> None:
+        self.period_s = period_s
+        self.pose = self.reported = start
+        self.twist = np.zeros(6)
+        self._set_twist = np.zeros(6)  # after the acceleration limit
+        self._wanted: FloatArray = np.zeros(6)
+        self._acceleration_m_s2 = 1.0
+        self._lag = Lag(parameters, [0.0] * 6, period_s)
+        self._jitter = Jitter(
+            parameters.jitter_rms_m, parameters.jitter_corner_rad_s, period_s, seed
+        )
+
+    def speed(self, twist: Sequence[float] | FloatArray, acceleration_m_s2: float) -> None:
+        """Go over to a twist (6,) in the base, under an acceleration limit, and keep it."""
+        self._wanted, self._acceleration_m_s2 = np.array(twist, dtype=float), acceleration_m_s2
+
+    def step(self) -> None:
+        """Advance one period."""
+        dt = self.period_s
+        self._set_twist = self._limited(self._wanted)
+        last = self.twist
+        self.twist = np.array(self._lag.step(self._set_twist.tolist()))
+        way = (last + self.twist) / 2 * dt
+        # the same object where nothing turns, so that what is computed from it can be kept
+        rotation = self.reported.rotation_rad
+        if way[3] or way[4] or way[5]:
+            rotation = (Rotation.from_rotvec(way[3:]) * self.reported.rotation).as_rotvec()
+        self.reported = Pose(self.reported.position_m + way[:3], rotation)
+        self.pose = Pose(self.reported.position_m + self._jitter.step(), rotation)
+
+    def _limited(self, wanted: FloatArray) -> FloatArray:
+        change = wanted - self._set_twist
+        linear = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
+        angular = math.sqrt(change[3] ** 2 + change[4] ** 2 + change[5] ** 2)
+        step = self._acceleration_m_s2 * self.period_s
+        largest = max(linear, angular * ROTATION_LEVER_M)
+        if largest <= step:
+            return wanted
+        return self._set_twist + change * (step / largest)
 
 
 class VirtualBench(Clock):
@@ -202,7 +258,7 @@ class VirtualArm:
             raise ArmError(fault, f"simulated fault: {fault.value}")
 
 
-class VirtualCell:
+class VirtualCell(Transducer):
     """A `Cell` on the bench: one wrench per period of the robot.
 
     With `TipForce` around it, it is a `ForceSource`.
@@ -228,14 +284,11 @@ class VirtualCell:
         parameters: CellParameters | None = None,
         seed: int = 0,
     ) -> None:
+        p = CellParameters.from_yaml() if parameters is None else parameters
+        super().__init__(p, seed)
         self.error: ForceFault | None = None
         self._bench = bench
-        self._parameters = CellParameters.from_yaml() if parameters is None else parameters
-        self._transducer = Transducer(self._parameters, seed)
-        self.faults: CellFaults = self._transducer.faults
-        self._scale = np.repeat(
-            [1 / self._parameters.force_divisor, 1 / self._parameters.torque_divisor], 3
-        )
+        self._scale = np.repeat([1 / p.force_divisor, 1 / p.torque_divisor], 3)
         self._waiting: list[CellSample] = []
         self._count = 0
         bench.on_step.append(self._measure)
@@ -243,7 +296,7 @@ class VirtualCell:
     @property
     def info(self) -> ForceInfo:
         """What it can do."""
-        p = self._parameters
+        p = self.parameters
         return ForceInfo(
             name=p.name,
             rate_hz=1 / self._bench.motion.period_s,
@@ -276,7 +329,7 @@ class VirtualCell:
 
     def _measure(self) -> None:
         force_n, torque_nm = self._bench.plant.wrench_at_cell()
-        counts, bits = self._transducer.convert((*force_n, *torque_nm))
+        counts, bits = self.convert((*force_n, *torque_nm))
         self._count += 1
         every = self.faults.lose_second_every
         if self.faults.silent or (every and self._count % every == 0):

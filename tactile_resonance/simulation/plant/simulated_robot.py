@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated controller on its ports, stepped by the time of its bench, and its control port.
+"""The simulated controller on its ports, stepped by the time of its bench.
+
+The dashboard server takes one line and answers one; requests and replies: Universal Robots, "Dashboard Server
+e-Series". Programs stored on the controller do not exist here: ``load`` finds none.
 
 The control port takes orders from outside, among them faults: one JSON object a line,
 ``{"command": NAME, ...}``; each is answered by one line, ``{"ok": true, ...}`` or
@@ -19,11 +22,95 @@ from tactile_resonance.clock import PORT as TIME_PORT
 from tactile_resonance.fields import number
 from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.plant.defaults import CONTROL_PORT
-from tactile_resonance.simulation.ur5e import dashboard, rtde_server
-from tactile_resonance.simulation.ur5e.controller import UrController
+from tactile_resonance.simulation.ur5e import rtde_server
+from tactile_resonance.simulation.ur5e.controller import (
+    POLYSCOPE,
+    SERIAL_NUMBER,
+    RefusedError,
+    UrController,
+)
 from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService, Reactor
-from tactile_resonance.simulation.ur5e.safety import RefusedError
 from tactile_resonance.simulation.ur5e.target import CYCLE_S
+
+DASHBOARD_PORT = 29999
+# What a robot in local control answers to everything that changes its state.
+_LOCAL = "Command is not allowed: the robot is not in remote control"
+
+
+class DashboardService(MessageService):
+    """One dashboard connection."""
+
+    LONGEST = 4096
+
+    def __init__(self, controller: UrController, connection: Connection) -> None:
+        super().__init__(connection)
+        connection.send(b"Connected: Universal Robots Dashboard Server\n")
+        self._controller = c = controller
+        # asked at any time
+        self._questions: dict[str, Callable[[], str]] = {
+            "robotmode": lambda: f"Robotmode: {c.safety.robot_mode.name}",
+            "safetymode": lambda: f"Safetymode: {c.safety.safety_mode.name}",
+            "safetystatus": lambda: f"Safetystatus: {c.safety.safety_mode.name}",
+            "programState": lambda: f"{'PLAYING' if c.program else 'STOPPED'} rtde_control",
+            "running": lambda: f"Program running: {str(c.program is not None).lower()}",
+            "is in remote control": lambda: str(c.remote_control).lower(),
+            "isProgramSaved": lambda: "true",
+            "get loaded program": lambda: "No program loaded",
+            "get robot model": lambda: "UR5",
+            "get serial number": lambda: SERIAL_NUMBER,
+            "PolyscopeVersion": lambda: f"URSoftware {'.'.join(map(str, POLYSCOPE))}",
+            "version": lambda: ".".join(map(str, POLYSCOPE)),
+        }
+        self._actions: dict[str, tuple[Callable[[], None], str]] = {
+            "power on": (c.safety.power_on, "Powering on"),
+            "power off": (c.power_off, "Powering off"),
+            "brake release": (c.safety.brake_release, "Brake releasing"),
+            "unlock protective stop": (
+                c.safety.unlock_protective_stop,
+                "Protective stop releasing",
+            ),
+            "restart safety": (lambda: None, "Restarting safety"),
+            "close popup": (c.close_popup, "closing popup"),
+            "close safety popup": (c.close_popup, "closing safety popup"),
+            "stop": (c.stop_program, "Stopped"),
+            "shutdown": (c.power_off, "Shutting down"),
+        }
+
+    def understand(self, message: bytes) -> None:
+        """Answer one line."""
+        request = message.decode("utf-8", "replace").strip()
+        self.connection.send((self._answer(request) + "\n").encode())
+        if request == "quit":
+            self.connection.close()
+
+    def _answer(self, request: str) -> str:
+        if request in self._questions:
+            return self._questions[request]()
+        if request == "quit":
+            return "Disconnected"
+        word, _, rest = request.partition(" ")
+        if word == "addToLog":
+            self._controller.log.append(rest)
+            return "Added log message"
+        if word == "setUserRole":
+            return f"Setting user role: {rest}"
+        if not self._controller.remote_control:
+            return _LOCAL
+        if request in self._actions:
+            action, answer = self._actions[request]
+            try:
+                action()
+            except RefusedError as error:
+                return str(error)
+            return answer
+        if word == "popup":
+            self._controller.popup = rest
+            return "showing popup"
+        if word == "load":
+            return f"File not found: {rest}"
+        if request in ("play", "pause"):
+            return f"Failed to execute: {request}"
+        return f"could not understand: '{request}'"
 
 
 class ControlService(MessageService):
@@ -153,7 +240,7 @@ class SimulatedRobot:
         self.time.packets_arrived = lambda: None if self.reactor.frozen else self.rtde.packets
         try:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
-            self.reactor.listen(dashboard.PORT, partial(dashboard.DashboardService, controller))
+            self.reactor.listen(DASHBOARD_PORT, partial(DashboardService, controller))
             self.reactor.listen(SCRIPT_PORT, lambda _: ScriptService(controller))
             self.reactor.listen(
                 control_port, partial(ControlService, orders=self.orders), freezable=False

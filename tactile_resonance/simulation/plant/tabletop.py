@@ -23,8 +23,8 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import number, read_dataclass, require
 from tactile_resonance.sensor import SensorParameters
-from tactile_resonance.simulation.cell.load_cell import LoadCell
 from tactile_resonance.simulation.cell.tcp_bus import TcpBus
+from tactile_resonance.simulation.cell.transducer import LoadCell
 from tactile_resonance.simulation.plant.plant import CellMounting, Plant
 from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, LaidScene, SurfaceMotion

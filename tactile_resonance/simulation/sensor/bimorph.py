@@ -19,7 +19,7 @@ lags behind its steady state by ``|p'| / Re(p)^2``, as it has to.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -305,6 +305,22 @@ def couple(sensor: SensorParameters, contact: HertzContact | None) -> CoupledBim
     return CoupledBimorph(
         sensor_modes(sensor), electric.input_resistance_ohm, electric.feedthrough, contact
     )
+
+
+def pole_trajectory(sensors: Iterable[CoupledBimorph]) -> ComplexArray:
+    """Return the pole of one resonance of each of some sensors, one after another in time [rad/s].
+
+    The resonance is that of the first whose natural frequency is nearest to 250 Hz, and then the nearest
+    to itself.
+    """
+    poles: list[complex] = []
+    for coupled in sensors:
+        if poles:
+            found = min((m.pole_rad_s for m in coupled.modes), key=lambda p: abs(p - poles[-1]))
+        else:
+            found = coupled.mode_near(250.0).pole_rad_s
+        poles.append(found)
+    return np.array(poles)
 
 
 def parts_of(length_s: float) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
 from tactile_resonance.simulation.ur5e import motion
@@ -13,8 +13,16 @@ from tactile_resonance.simulation.ur5e.forces import ForceTask, ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
 from tactile_resonance.simulation.ur5e.machine import Machine
 from tactile_resonance.simulation.ur5e.poses import ZERO, Six, pose_from_transform, product
-from tactile_resonance.simulation.ur5e.registers import Script, Thread
-from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError, Target
+from tactile_resonance.simulation.ur5e.target import (
+    CYCLE_S,
+    ProtectiveStop,
+    ScriptError,
+    Target,
+    Thread,
+)
+
+if TYPE_CHECKING:
+    from tactile_resonance.simulation.ur5e.program import Program
 
 SpeedMotion = Callable[[Target, Six, float, float], Thread]
 
@@ -31,7 +39,7 @@ FORCE_MODE_STOP = 10.0
 class Handlers:
     """What commands do that move the arm or set something; a generator where that takes time."""
 
-    def __init__(self, script: Script, machine: Machine) -> None:
+    def __init__(self, script: Program, machine: Machine) -> None:
         self._script = script
         self._machine = machine
         self._target = machine.target
@@ -249,7 +257,7 @@ class Handlers:
             self._machine.external = None
 
 
-def commands(script: Script, machine: Machine) -> dict[int, Callable[[], Thread | None]]:
+def commands(script: Program, machine: Machine) -> dict[int, Callable[[], Thread | None]]:
     """What the client's program does, by the number of the command."""
     does, target = Handlers(script, machine), machine.target
     pose, doubles = script.pose, script.doubles

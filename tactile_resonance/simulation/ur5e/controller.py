@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated controller, stepped in robot time: registers, program, safety, arm and outputs."""
+"""A simulated UR5e with its e-series controller, stepped in robot time.
+
+Here are power, brakes and stops of the robot, and what brings registers, program, arm and outputs together.
+Numbers of modes and bits: Universal Robots, "Real-Time Data Exchange (RTDE) Guide".
+
+What it is not: URScript is not interpreted (the client's control program is known by its name, other
+programs are refused), paths with blends, teach mode, freedrive and direct torque are not modelled. The
+arm has no dynamics beyond dead time, lag and vibration: nothing makes it deviate but force mode, no
+collision is detected but by the measured force. Where the maker publishes no figure (force mode's
+gains, the threshold of tool contact, servoj's gain, currents) the model's own stands beside its name.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +22,17 @@ import numpy as np
 
 from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.ur5e.machine import Environment, Machine, MachineConfig
-from tactile_resonance.simulation.ur5e.outputs import READERS, OutputValue
 from tactile_resonance.simulation.ur5e.poses import largest
 from tactile_resonance.simulation.ur5e.program import Program, register_offset
-from tactile_resonance.simulation.ur5e.registers import (
-    INPUT_TYPES,
+from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError
+from tactile_resonance.simulation.ur5e.variables import (
     INT_INPUTS,
     LARGEST_FIGURE,
+    OUTPUTS,
     InputValue,
-    Ports,
+    OutputValue,
     Registers,
-    write_registers,
 )
-from tactile_resonance.simulation.ur5e.safety import RefusedError, Safety
-from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError
 
 # Lines of the controller's log that are kept.
 _LOG_LINES = 200
@@ -34,6 +41,139 @@ _AT_REST_RAD_S = 0.05
 # Major, minor, bugfix, build.
 POLYSCOPE = (5, 21, 0, 0)
 SERIAL_NUMBER = "20265500001"
+
+
+class RobotMode(IntEnum):
+    """RTDE output ``robot_mode``."""
+
+    POWER_OFF = 3
+    POWER_ON = 4
+    IDLE = 5
+    RUNNING = 7
+
+
+class SafetyMode(IntEnum):
+    """RTDE output ``safety_mode``."""
+
+    NORMAL = 1
+    PROTECTIVE_STOP = 3
+    ROBOT_EMERGENCY_STOP = 7
+
+
+# Bits of RTDE output ``safety_status_bits``.
+_STATUS_BITS = {
+    SafetyMode.NORMAL: 1 << 0,
+    SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
+}
+
+# After a protective stop the robot refuses to be unlocked for this long [s] (dashboard server manual).
+UNLOCK_DELAY_S = 5.0
+# Time that powering on and releasing the brakes take each [s]; seconds on a real robot.
+SWITCHING_S = 0.2
+
+
+class RefusedError(Exception):
+    """The controller refuses what was asked of it, as its dashboard would answer."""
+
+
+class Safety:
+    """Modes of the robot.
+
+    Attributes
+    ----------
+    robot_mode : RobotMode
+    safety_mode : SafetyMode
+    """
+
+    def __init__(self) -> None:
+        self.robot_mode: RobotMode = RobotMode.RUNNING
+        self.safety_mode: SafetyMode = SafetyMode.NORMAL
+        self._time_s = 0.0
+        self._next_mode: RobotMode | None = None
+        self._due_s = 0.0
+        self._stopped_s = 0.0
+
+    @property
+    def may_move(self) -> bool:
+        """Brakes released, no stop in force."""
+        return self.robot_mode is RobotMode.RUNNING and self.safety_mode is SafetyMode.NORMAL
+
+    @property
+    def powered(self) -> bool:
+        """Whether motors, not brakes, hold the joints."""
+        return self.robot_mode is RobotMode.RUNNING
+
+    @property
+    def status_bits(self) -> int:
+        """RTDE output ``safety_status_bits``."""
+        return _STATUS_BITS[self.safety_mode]
+
+    def step(self, time_s: float, at_rest: bool) -> None:
+        """Advance to a time; at rest, a stop that removes power does so."""
+        self._time_s = time_s
+        if self._next_mode is not None and time_s >= self._due_s:
+            self.robot_mode, self._next_mode = self._next_mode, None
+        if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP and at_rest:
+            self.power_off()
+
+    def power_on(self) -> None:
+        """Power the arm; its brakes stay closed."""
+        self._require_normal("power on")
+        if self.robot_mode is RobotMode.POWER_OFF:
+            self.robot_mode = RobotMode.POWER_ON
+            self._switch(RobotMode.IDLE)
+
+    def brake_release(self) -> None:
+        """Release the brakes, powering the arm first where it is off."""
+        self._require_normal("release brakes")
+        if self.robot_mode is RobotMode.POWER_OFF:
+            self.robot_mode = RobotMode.POWER_ON
+        if self.robot_mode is not RobotMode.RUNNING:
+            self._switch(RobotMode.RUNNING)
+
+    def power_off(self) -> None:
+        """Close the brakes and remove power."""
+        self.robot_mode, self._next_mode = RobotMode.POWER_OFF, None
+
+    def protective_stop(self) -> None:
+        """Stop, power kept, until unlocked."""
+        if self.safety_mode is SafetyMode.NORMAL:
+            self.safety_mode = SafetyMode.PROTECTIVE_STOP
+            self._stopped_s = self._time_s
+
+    def unlock_protective_stop(self) -> None:
+        """End a protective stop.
+
+        Raises
+        ------
+        RefusedError
+            Within 5 s of the stop.
+        """
+        if self.safety_mode is not SafetyMode.PROTECTIVE_STOP:
+            return
+        if self._time_s - self._stopped_s < UNLOCK_DELAY_S:
+            raise RefusedError(
+                "Cannot unlock protective stop until 5s after occurrence. "
+                "Always inspect cause of protective stop before unlocking"
+            )
+        self.safety_mode = SafetyMode.NORMAL
+
+    def emergency_stop(self) -> None:
+        """Press the emergency stop: brake, then remove power."""
+        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
+
+    def release_emergency_stop(self) -> None:
+        """Release the button; the arm stays without power."""
+        if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
+            self.safety_mode = SafetyMode.NORMAL
+
+    def _require_normal(self, action: str) -> None:
+        if self.safety_mode is not SafetyMode.NORMAL:
+            raise RefusedError(f"cannot {action} in safety mode {self.safety_mode.name}")
+
+    def _switch(self, mode: RobotMode) -> None:
+        self._next_mode, self._due_s = mode, self._time_s + SWITCHING_S
 
 
 class RuntimeState(IntEnum):
@@ -56,8 +196,6 @@ class UrController:
     safety : Safety
         Modes and stops.
     registers : Registers
-    ports : Ports
-        Digital and analogue outputs, speed slider.
     program : Program or None
         The program that runs.
     stood_still_s : float
@@ -84,7 +222,6 @@ class UrController:
         )
         self.safety: Safety = Safety()
         self.registers: Registers = Registers()
-        self.ports: Ports = Ports()
         self.program: Program | None = None
         self.runtime_state: RuntimeState = RuntimeState.STOPPED
         self.remote_control = True
@@ -109,25 +246,22 @@ class UrController:
         self.machine.reseed(np.random.default_rng(seed))
 
     @property
+    def status_bits(self) -> int:
+        """RTDE output ``robot_status_bits``: power in bit 0, a running program in bit 1."""
+        powered = self.safety.robot_mode is not RobotMode.POWER_OFF
+        return int(powered) | int(self.program is not None) << 1
+
+    @property
     def rests(self) -> bool:
         """Whether nothing has moved for a while, and nothing is touched."""
         return self.machine.rests and self.runtime_state is not RuntimeState.STOPPING
 
     def write_inputs(self, values: Mapping[str, InputValue]) -> None:
-        """Take one package of RTDE inputs, by name.
+        """Take one package of RTDE inputs, by name; raises as `Registers.write`.
 
         The way to write registers: a watchdog counts what is written here, whatever the value.
-
-        Raises
-        ------
-        KeyError
-            Where an input is not known; nothing is written then.
         """
-        if not INPUT_TYPES.keys() >= values.keys():
-            unknown = next(name for name in values if name not in INPUT_TYPES)
-            raise KeyError(f"RTDE input {unknown!r}: not known")
-        write_registers(self.registers, values)
-        self.ports.write(values)
+        self.registers.write(values)
         if "external_force_torque" in values:
             wrench = np.array(values["external_force_torque"], dtype=float).tolist()
             if all(abs(value) <= LARGEST_FIGURE for value in wrench):
@@ -143,9 +277,9 @@ class UrController:
         KeyError
             Where the output is not known.
         """
-        if name not in READERS:
+        if name not in OUTPUTS:
             raise KeyError(f"RTDE output {name!r}: not known")
-        value = READERS[name](self)
+        value = OUTPUTS[name][1](self)
         return list(value) if isinstance(value, tuple) else value
 
     def start_program(self, text: str) -> None:
@@ -203,7 +337,7 @@ class UrController:
         self._cycles += 1
         target = self.machine.target
         target.begin_cycle()
-        target.pace = self.ports.speed_slider
+        target.pace = self.registers.speed_slider
         self._watch()
         if self.program is not None:
             self._run_program()

@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arm as a machine: targets, joints, flange sensor and what the tool touches, on one clock.
 
-The joints follow their targets, and the tip trembles beside them.
+The joints follow their targets, with dead time and lag, and the tip trembles beside them.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from tactile_resonance.contact.vectors import Vector, dot, rotated_back
-from tactile_resonance.simulation.noise import Seed
+from tactile_resonance.fields import check_above_zero, check_not_negative
+from tactile_resonance.simulation.noise import Jitter, Seed
 from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
     ForceMode,
@@ -44,7 +46,72 @@ from tactile_resonance.simulation.ur5e.target import (
     Target,
     rate,
 )
-from tactile_resonance.simulation.ur5e.tracking import Jitter, Lag, TrackingParameters
+
+
+@dataclass(frozen=True)
+class TrackingParameters:
+    """How an arm follows; the defaults are chosen to resemble a UR e-series, not measured on one.
+
+    Attributes
+    ----------
+    dead_time_s : float
+        From a command to the first motion [s].
+    lag_s : float
+        Time constant of the motion behind its set point [s].
+    jitter_rms_m : float
+        Vibration of the tip on each axis [m], unseen by the joint encoders.
+    jitter_corner_rad_s : float
+        Its spectrum falls as of white noise through two poles at this rate [rad/s].
+    """
+
+    dead_time_s: float = 0.004
+    lag_s: float = 0.010
+    jitter_rms_m: float = 3e-6
+    jitter_corner_rad_s: float = 50.0
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "dead_time_s", "lag_s", "jitter_rms_m")
+        check_above_zero(self, "jitter_corner_rad_s")
+
+
+class Lag:
+    """Any number of axes behind their set points: dead time, then a first-order lag.
+
+    Exact for set points that run linearly over each period; a dead time that is no multiple of the
+    period is interpolated.
+
+    Attributes
+    ----------
+    value : tuple of float
+        Where the axes are.
+    """
+
+    def __init__(
+        self, parameters: TrackingParameters, start: Sequence[float], period_s: float
+    ) -> None:
+        self.value = tuple(start)
+        periods = parameters.dead_time_s / period_s
+        whole = int(periods + 1e-9)
+        self._fraction = max(0.0, periods - whole)
+        self._line: deque[Sequence[float]] = deque([self.value] * (whole + 2), maxlen=whole + 2)
+        self._delayed: Sequence[float] = self.value
+        lag = parameters.lag_s
+        self._decay = math.exp(-period_s / lag) if lag > 0 else 0.0
+        self._slope = lag / period_s * (1 - self._decay)
+
+    def step(self, target: Sequence[float]) -> tuple[float, ...]:
+        """Advance one period, at whose end the set points are `target`; return `value`."""
+        line, before, decay, slope = self._line, self._delayed, self._decay, self._slope
+        line.append(target)
+        now = line[1]
+        if self._fraction:
+            now = [b + self._fraction * (a - b) for a, b in zip(line[0], now, strict=True)]
+        if now is before and tuple(now) == self.value:  # at rest
+            return self.value
+        self._delayed = now
+        axes = zip(self.value, before, now, strict=True)
+        self.value = tuple([n + decay * (value - b) - slope * (n - b) for value, b, n in axes])
+        return self.value
 
 
 class Joints:
@@ -62,7 +129,7 @@ class Joints:
 
     def __init__(self, q: Six, tracking: TrackingParameters, seed: Seed) -> None:
         self._tracking = tracking
-        self._jitter = Jitter(tracking, CYCLE_S, seed)
+        self._jitter = Jitter(tracking.jitter_rms_m, tracking.jitter_corner_rad_s, CYCLE_S, seed)
         self.posture = Posture(q)
         self.tremble_m: Vector = ORIGIN
         self.hold()

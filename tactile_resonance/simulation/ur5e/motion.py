@@ -24,8 +24,7 @@ from tactile_resonance.simulation.ur5e.poses import (
     turn_between,
     turned,
 )
-from tactile_resonance.simulation.ur5e.registers import Thread
-from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
+from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target, Thread
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,21 @@ where the program was made for the upper range.
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Iterable
 
+from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.simulation.ur5e.commands import commands
 from tactile_resonance.simulation.ur5e.machine import Machine
-from tactile_resonance.simulation.ur5e.registers import Registers, Script, Thread
-from tactile_resonance.simulation.ur5e.target import ScriptError
+from tactile_resonance.simulation.ur5e.poses import Transform, transform_from_pose
+from tactile_resonance.simulation.ur5e.target import ScriptError, Thread
+from tactile_resonance.simulation.ur5e.variables import (
+    DOUBLE_INPUTS,
+    INT_INPUTS,
+    LARGEST_FIGURE,
+    Registers,
+)
 
 # Commands that are done anew in every cycle in which they stand in the command register.
 STREAMING = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58})
@@ -25,6 +34,10 @@ STOP_SCRIPT = 255
 
 # Force mode as the client's program sets it when it starts.
 _GAIN_SCALING, _DAMPING = 0.5, 0.025
+
+# An asynchronous motion's progress word: counters of 7 bits, then a flag, then 15 bits of progress.
+_COUNTER_SPAN = 128
+_RUNNING = 1 << 15
 
 
 def register_offset(text: str) -> int:
@@ -46,8 +59,8 @@ def register_offset(text: str) -> int:
     return int(found[1])
 
 
-class Program(Script):
-    """A running control program.
+class Program:
+    """A running control program: its registers, its threads and its loop.
 
     Parameters
     ----------
@@ -56,12 +69,29 @@ class Program(Script):
     registers : Registers
     offset : int
         As `register_offset` returns it.
+
+    Attributes
+    ----------
+    offset : int
+        Added to all register numbers: 0 or 24.
+    threads : dict of str to generator
+        Running threads by name.
+    watchdog_s : float or None
+        Longest time without a refresh of the command register; None without a watchdog.
+    internal_command : int
+        Set by a thread for the main loop, where no command of the client waits.
     """
 
     def __init__(self, machine: Machine, registers: Registers, offset: int) -> None:
         machine.force_mode.gain_scaling = _GAIN_SCALING
         machine.force_mode.damping = _DAMPING
-        super().__init__(registers, offset)
+        self.offset = offset
+        self.threads: dict[str, Thread] = {}
+        self.watchdog_s: float | None = None
+        self.internal_command = 0
+        self._registers = registers
+        self._progress_writes = 0
+        self._operation = 0
         self._commands = commands(self, machine)
         self._main = self._loop()
 
@@ -77,7 +107,13 @@ class Program(Script):
             next(self._main)
         except StopIteration:
             return False
-        self.step_threads()
+        for name, thread in list(self.threads.items()):
+            if self.threads.get(name) is not thread:
+                continue  # ended by one that stepped before it
+            try:
+                next(thread)
+            except StopIteration:
+                self.kill(name)
         return True
 
     def _loop(self) -> Thread:
@@ -114,3 +150,72 @@ class Program(Script):
         work = self._commands[command]()
         if work is not None:
             yield from work
+
+    def run(self, name: str, thread: Thread) -> None:
+        """Start a thread; it takes its first step in this cycle, after the main loop."""
+        self.threads[name] = thread
+
+    def kill(self, name: str) -> bool:
+        """End a thread and say whether it was running."""
+        return self.threads.pop(name, None) is not None
+
+    def integer(self, number: int) -> int:
+        """Return an integer input register."""
+        return self._registers.inputs[INT_INPUTS[number + self.offset]]  # type: ignore[return-value]
+
+    def double(self, number: int) -> float:
+        """Return a double input register; raises as `doubles`."""
+        return self.doubles(number, 1)[0]
+
+    def vector(self, number: int) -> Vector:
+        """Return three double input registers; raises as `doubles`."""
+        x, y, z = self.doubles(number, 3)
+        return x, y, z
+
+    def pose(self, number: int = 0) -> Transform:
+        """Return the transform of a pose in six double input registers; raises as `doubles`."""
+        return transform_from_pose(self.doubles(number))
+
+    def doubles(self, number: int, count: int = 6) -> tuple[float, ...]:
+        """Return double input registers.
+
+        Raises
+        ------
+        ScriptError
+            If one of them is not finite or beyond +-1e6.
+        """
+        first, inputs = number + self.offset, self._registers.inputs
+        values = tuple([inputs[name] for name in DOUBLE_INPUTS[first : first + count]])
+        if not (math.isfinite(sum(values)) and max(map(abs, values)) <= LARGEST_FIGURE):
+            raise ScriptError(
+                f"input_double_register_{first}...: {list(values)}; accepted are numbers within "
+                f"+-{LARGEST_FIGURE:g}"
+            )
+        return values
+
+    def status(self, value: int) -> None:
+        """Write the state of the command loop."""
+        self._registers.output_int[self.offset] = value
+
+    def answer(self, value: int) -> None:
+        """Write an integer result."""
+        self._registers.output_int[1 + self.offset] = int(value)
+
+    def answer_doubles(self, values: Iterable[float]) -> None:
+        """Write a vector result."""
+        for place, value in enumerate(values):
+            self._registers.output_double[place + self.offset] = value
+
+    def begin_asynchronous(self) -> None:
+        """Tell that an asynchronous operation begins."""
+        self._operation = (self._operation + 1) % _COUNTER_SPAN
+        self._write_progress(_RUNNING)
+
+    def end_asynchronous(self) -> None:
+        """Tell that no asynchronous operation runs."""
+        self._write_progress(0)
+
+    def _write_progress(self, state: int) -> None:
+        self._progress_writes = (self._progress_writes + 1) % _COUNTER_SPAN
+        word = (self._operation << 24) + (self._progress_writes << 16) + state
+        self._registers.output_int[2 + self.offset] = word

@@ -14,9 +14,8 @@ from enum import IntEnum
 from typing import Any
 
 from tactile_resonance.simulation.ur5e.controller import POLYSCOPE, UrController
-from tactile_resonance.simulation.ur5e.outputs import OUTPUT_TYPES, READERS, Reader
 from tactile_resonance.simulation.ur5e.reactor import Connection
-from tactile_resonance.simulation.ur5e.registers import INPUT_TYPES
+from tactile_resonance.simulation.ur5e.variables import INPUT_TYPES, OUTPUTS, Reader
 
 PROTOCOL_VERSION = 2
 LONGEST_PAYLOAD = 0xFFFF - 3
@@ -274,19 +273,17 @@ class _Service:
             return b"\x00"
         self._period = round(CYCLE_HZ / frequency_hz)
         names = _names(payload[8:])
-        known = OUTPUT_TYPES
-        types = [known.get(name, "NOT_FOUND") for name in names]
+        types = [OUTPUTS[name][0] if name in OUTPUTS else "NOT_FOUND" for name in names]
         if "NOT_FOUND" in types:
             return b"\x00" + ",".join(types).encode()
-        self._outputs = _Recipe(names, Layout(types), tuple(READERS[name] for name in names))
+        self._outputs = _Recipe(names, Layout(types), tuple(OUTPUTS[name][1] for name in names))
         self._newest = b""
         return b"\x01" + ",".join(types).encode()
 
     def _set_up_inputs(self, payload: bytes) -> bytes:
         names = _names(payload)
-        known = INPUT_TYPES
         types = [
-            "IN_USE" if self._server.claimed(name, self) else known.get(name, "NOT_FOUND")
+            "IN_USE" if self._server.claimed(name, self) else INPUT_TYPES.get(name, "NOT_FOUND")
             for name in names
         ]
         if "IN_USE" in types or "NOT_FOUND" in types:

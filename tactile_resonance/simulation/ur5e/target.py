@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass
 from operator import sub
 
@@ -27,6 +28,9 @@ from tactile_resonance.simulation.ur5e.poses import (
 
 # The control period of an e-series [s].
 CYCLE_S = 0.002
+
+# Of a program: steps once in a cycle, until it is done.
+Thread = Generator[None, None, None]
 
 
 class ScriptError(Exception):

@@ -30,7 +30,7 @@ from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import NOTHING, SIZE, SPEED, Exchange, UrCommand
-from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
+from tactile_resonance.simulation.ur5e.machine import TrackingParameters
 
 
 def test_each_tick_sees_exactly_the_state_of_its_time(robot, high):

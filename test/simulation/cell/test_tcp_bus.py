@@ -12,12 +12,12 @@ from types import SimpleNamespace
 import pytest
 
 from tactile_resonance.simulation.cell import tcp_bus
-from tactile_resonance.simulation.cell.load_cell import CanFrame
 from tactile_resonance.simulation.cell.tcp_bus import (
     QUIET_S,
     SlcanServer,
     SocketcandServer,
 )
+from tactile_resonance.simulation.cell.transducer import CanFrame
 from tactile_resonance.simulation.plant.bench_time import STALL_S
 from tactile_resonance.simulation.ur5e import reactor as reactor_module
 from tactile_resonance.simulation.ur5e.reactor import MessageService, Reactor

@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tactile_resonance.simulation.cell.load_cell import LoadCell
-from tactile_resonance.simulation.cell.transducer import CellParameters, Transducer
-from tactile_resonance.simulation.noise import ROWS
+from tactile_resonance.simulation.cell.transducer import CellParameters, LoadCell, Transducer
+from tactile_resonance.simulation.noise import ROWS, Jitter
 from tactile_resonance.simulation.ur5e.controller import UrController
 from tactile_resonance.simulation.ur5e.forces import FtSensor, FtSpecification
+from tactile_resonance.simulation.ur5e.machine import TrackingParameters
 from tactile_resonance.simulation.ur5e.poses import ZERO
-from tactile_resonance.simulation.ur5e.tracking import Jitter, TrackingParameters
 
 SEEDS = (7, [3, 1, 4], np.random.SeedSequence([3, 1, 4]))
 # so many counts that their step is far below the noise; neither bias nor drift
@@ -63,7 +62,7 @@ def test_robots_with_different_histories_have_the_noise_of_one_seed(seed):
 def test_vibration_and_drift_begin_anew_in_their_stationary_state():
     specification, parameters = FtSpecification(), TrackingParameters()
     sensor = FtSensor(specification, np.random.default_rng(1))
-    jitter = Jitter(parameters, 0.002, 1)
+    jitter = Jitter(parameters.jitter_rms_m, parameters.jitter_corner_rad_s, 0.002, 1)
     offset = specification.accuracy / 2 * np.random.default_rng(1).standard_normal(6)
     drifts, places = [], []
     for seed in range(400):

@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tactile_resonance.simulation.sensor.bench import BenchEffects
-from tactile_resonance.simulation.sensor.bimorph import INTERVAL_S, VaryingStream, couple, parts_of
-from tactile_resonance.simulation.sensor.changing_contact import (
+from tactile_resonance.simulation.sensor.bench import (
+    BenchEffects,
     BenchTip,
     ContactSoFar,
+)
+from tactile_resonance.simulation.sensor.bimorph import (
+    INTERVAL_S,
+    VaryingStream,
+    couple,
+    parts_of,
     pole_trajectory,
 )
 from tactile_resonance.simulation.sensor.response import Lines, ResponseStream

@@ -8,8 +8,7 @@ import pytest
 
 from tactile_resonance.simulation.ur5e.controller import UrController
 from tactile_resonance.simulation.ur5e.forces import FtSpecification
-from tactile_resonance.simulation.ur5e.machine import MachineConfig
-from tactile_resonance.simulation.ur5e.tracking import TrackingParameters
+from tactile_resonance.simulation.ur5e.machine import MachineConfig, TrackingParameters
 
 PROGRAM = """
 def rtde_control():

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tactile_resonance.simulation.ur5e.controller import RuntimeState
-from tactile_resonance.simulation.ur5e.safety import SafetyMode
+from tactile_resonance.simulation.ur5e.controller import RuntimeState, SafetyMode
 
 sys.path.insert(0, str(Path(__file__).parent))
 from commands import SETTLED_S, apart, unpacked

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.simulation.ur5e.safety import SafetyMode
+from tactile_resonance.simulation.ur5e.controller import SafetyMode
 
 ODD = (1e300, -1e20, 2e6, 5e-324, np.nan, np.inf)
 COMMANDS = range(1, 70)

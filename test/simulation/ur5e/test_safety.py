@@ -4,9 +4,14 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.simulation.ur5e.controller import RuntimeState, UrController
-from tactile_resonance.simulation.ur5e.outputs import OUTPUT_TYPES
-from tactile_resonance.simulation.ur5e.safety import RefusedError, RobotMode, SafetyMode
+from tactile_resonance.simulation.ur5e.controller import (
+    RefusedError,
+    RobotMode,
+    RuntimeState,
+    SafetyMode,
+    UrController,
+)
+from tactile_resonance.simulation.ur5e.variables import OUTPUTS
 
 PROGRAM = """def rtde_control():
   global reg_offset_int = 0
@@ -139,7 +144,7 @@ def test_every_output_has_the_shape_of_its_type():
     controller = UrController(seed=3)
     run(controller, 0.01)
     lengths = {"VECTOR6D": 6, "VECTOR3D": 3, "VECTOR6INT32": 6}
-    for name, kind in OUTPUT_TYPES.items():
+    for name, (kind, _) in OUTPUTS.items():
         value = controller.outputs(name)
         if kind in lengths:
             assert len(value) == lengths[kind], name

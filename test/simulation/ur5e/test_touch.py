@@ -13,8 +13,8 @@ from tactile_resonance.simulation.plant.surfaces import FlatSurface
 from tactile_resonance.simulation.plant.tip import RigidTip
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
+from tactile_resonance.simulation.ur5e.controller import SafetyMode
 from tactile_resonance.simulation.ur5e.machine import MachineConfig
-from tactile_resonance.simulation.ur5e.safety import SafetyMode
 
 sys.path.insert(0, str(Path(__file__).parent))
 from matrices import forward, matrix_from_pose

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.plant.tip_motion import TipMotion
-from tactile_resonance.simulation.ur5e.tracking import Jitter, Lag, TrackingParameters
+from tactile_resonance.simulation.noise import Jitter
+from tactile_resonance.simulation.plant.contact_bench import TipMotion
+from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
 
 STILL = TrackingParameters(jitter_rms_m=0.0)
 START = Pose(np.array([0.3, 0.1, 0.2]), np.array([0.0, 0.0, 0.0]))
@@ -50,8 +51,7 @@ def test_speed_is_reached_under_the_acceleration_limit_and_the_way_is_its_integr
 
 
 def test_vibration_has_its_rms_and_its_correlation():
-    parameters = TrackingParameters(jitter_rms_m=3e-6, jitter_corner_rad_s=50.0)
-    jitter = Jitter(parameters, 0.002, seed=1)
+    jitter = Jitter(3e-6, 50.0, 0.002, seed=1)
     x = np.array([jitter.step() for _ in range(100_000)])  # 200 s, about 2500 free values per axis
     assert x.std() == pytest.approx(3e-6, rel=0.05)
     for lag in (5, 10, 20):
@@ -59,7 +59,7 @@ def test_vibration_has_its_rms_and_its_correlation():
         want = (1 + t) * np.exp(-t)
         got = np.mean(x[lag:] * x[:-lag]) / np.mean(x * x)
         assert got == pytest.approx(want, abs=0.05)
-    again = Jitter(parameters, 0.002, seed=1)
+    again = Jitter(3e-6, 50.0, 0.002, seed=1)
     np.testing.assert_array_equal(x[:3], [again.step() for _ in range(3)])
 
 

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.simulation.cell.load_cell import FILTERS_HZ, RATES_HZ, LoadCell
-from tactile_resonance.simulation.cell.transducer import CellParameters, Transducer
+from tactile_resonance.simulation.cell.transducer import (
+    FILTERS_HZ,
+    RATES_HZ,
+    CellParameters,
+    LoadCell,
+    Transducer,
+)
 
 QUIET = CellParameters("quiet", 5000.0, 100000.0, 0.0, 0.0, 5.0, 0.3)
 FIRST, SECOND = 0x001, 0x002
