@@ -141,9 +141,7 @@ def analyse(
         warnings.append(f"excited lines found from the input spectrum: {harmonics.size}")
     found = time.perf_counter()
     frf = frf_of_record(record, harmonics, sample_rate_hz=rate_hz, method=frf_method)
-    faults = find_faults(
-        record, sample_rate_hz=rate_hz, harmonics=harmonics, transient_removed=record.periods > 1
-    )
+    faults = find_faults(record, sample_rate_hz=rate_hz, harmonics=harmonics)
     estimated = time.perf_counter()
     if channel_delay_s:
         frf = correct_skew(frf, channel_delay_s)

@@ -126,12 +126,8 @@ class MeasurementFrf:
             )
         self._remember(record)
         block = Spectrum.of(u.reshape(-1, n), y.reshape(-1, n))
-        found = find_faults(
-            block,
-            sample_rate_hz=excitation.sample_rate_hz,
-            harmonics=excitation.harmonics,
-            transient_removed=True,
-        )
+        rate_hz, harmonics = excitation.sample_rate_hz, excitation.harmonics
+        found = find_faults(block, sample_rate_hz=rate_hz, harmonics=harmonics)
         self._faults = worst_of([[*self._faults.faults, *found.faults]])
         so_far = self._periods.setdefault(record.realisation, 0)
         if record.block_index * (u.size // n) != so_far:
