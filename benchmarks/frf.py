@@ -18,10 +18,9 @@ import scipy.fft
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.frf.estimate import frf_of_realisations, frf_of_record
-from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra, transient_free_spectra
 from tactile_resonance.multisine import Excitation, design_multisine
 from tactile_resonance.record import Channel, Record
 

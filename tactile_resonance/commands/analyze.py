@@ -25,7 +25,7 @@ from tactile_resonance.commands.options import add_band, add_figure, add_file, a
 from tactile_resonance.contact_analysis import ContactAnalysis, contact_content, estimate_contact
 from tactile_resonance.fields import band, require
 from tactile_resonance.files import write_whole
-from tactile_resonance.frf.estimate import METHODS
+from tactile_resonance.frf.spectra import METHODS
 from tactile_resonance.front import FIELDS, read_record, read_run
 from tactile_resonance.poles.estimator import CANDIDATES
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, ModelStructure
