@@ -13,12 +13,11 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import band, known, number, require, require_kind
-from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.distortion import Distortion, estimate_distortion
 from tactile_resonance.frf.estimate import frf_of_record, with_narrow_modes_judged
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.faults import FaultReport, find_faults
-from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.result import FRF, band_bins
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.estimator import POLES_METHODS, choose_among, poles_of_frf

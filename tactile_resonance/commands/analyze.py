@@ -30,7 +30,7 @@ from tactile_resonance.front import FIELDS, read_record, read_run
 from tactile_resonance.poles.estimator import CANDIDATES
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, ModelStructure
 from tactile_resonance.recording.recording import Recording
-from tactile_resonance.silent import check_undriven, silent_record
+from tactile_resonance.tones import check_undriven, silent_record
 
 if TYPE_CHECKING:
     from tactile_resonance.scan.run_content import RunContent

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The FRF of a record: mean spectra, their ratio, its covariances, and whether it can be relied on.
 
-Of several realisations also whether they are of one system, in steady state: the mean of responses that contradict
-each other is the response of none of them. One was recorded with the polarity or the gain changed, without the
-sensor, or beside the wrong actuator signal.
+Of several realisations also whether they are of one system, in steady state: the mean of responses that
+contradict each other is the response of none of them. One was recorded with the polarity or the gain changed,
+without the sensor, or beside the wrong actuator signal.
 """
 
 from __future__ import annotations

@@ -11,11 +11,10 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.force_spread import joined_spread
-from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
 from tactile_resonance.frf.distortion import DETECTING, distortion_in_band
 from tactile_resonance.frf.estimate import frf_of_realisations
 from tactile_resonance.frf.faults import FaultReport, find_faults, worst_of
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF, BandBins, FrfStatus, band_bins, stacked_bins
 from tactile_resonance.frf.skew import correct_skew
 from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, mean_spectra, stacked_spectra
 from tactile_resonance.multisine import Excitation

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spectra of periodic records: each is transformed once; means of its periods, and the covariance of their noise.
+"""Spectra of periodic records, each transformed once; means of its periods, and the covariance of their noise.
 
-The spectrum of P consecutive periods has P - 1 bins between harmonics, which a periodic excitation leaves to noise
-and transient. The fast local polynomial method fits a polynomial in the bin offset to the nearest of them around
-each line, extrapolates it to the line and subtracts it, for input and output alike; the residuals of the fit give
-the 2 x 2 noise covariance. The neighbours lie alike around all lines but those at the ends of the spectrum, so
-the fit is one constant real matrix times the bins around all lines.
+The spectrum of P consecutive periods has P - 1 bins between harmonics. A periodic excitation leaves them to
+noise and transient. The fast local polynomial method fits a polynomial in the bin offset to the nearest of them
+around each line, extrapolates it to the line and subtracts it, for input and output alike; the residuals of the
+fit give the 2 x 2 noise covariance. The neighbours lie alike around all lines but those at the ends of the
+spectrum, so the fit is one constant real matrix times the bins around all lines.
 """
 
 from __future__ import annotations

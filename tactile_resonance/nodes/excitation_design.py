@@ -10,9 +10,8 @@ import numpy as np
 from rclpy.node import Node
 
 from tactile_resonance.action import Measure
-from tactile_resonance.crest_factor import compress_crest_factor
 from tactile_resonance.drivers.acquisition import DeviceInfo
-from tactile_resonance.multisine import Excitation, Grid, design_multisine
+from tactile_resonance.multisine import Excitation, Grid, compress_crest_factor, design_multisine
 from tactile_resonance.nodes.parameters import Fixed, Parameter
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.recording.messages import GRIDS, each_from_message, key_of

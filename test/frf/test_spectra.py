@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Transforms of records: what they are, in which precision, once each; the fast local polynomial method: reference
-answers, exactness, sign convention, edges, refusals.
+"""Transforms of records: what they are, in which precision, and that they are made once.
+
+Fast local polynomial method: reference answers, exactness, sign convention, edges, refusals.
 """
 
 import numpy as np
