@@ -14,8 +14,12 @@ import numpy as np
 import pytest
 
 from tactile_resonance.record import Channel, Contact, Origin, Record
-from tactile_resonance.recording.store import RecordStore, read_store_recording
-from tactile_resonance.recording.stored_file import read_stored, write_stored
+from tactile_resonance.recording.store import (
+    RecordStore,
+    read_store_recording,
+    read_stored,
+    write_stored,
+)
 
 sys.path.insert(0, str(Path(__file__).parent))
 import stores
