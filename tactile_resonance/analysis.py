@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole recording to FRF and poles, through the functions the nodes use, and its JSON."""
+"""A whole recording to FRF and poles, through the functions the nodes use, and the content of its JSON."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -192,10 +191,10 @@ def analyse(
     )
 
 
-def analysis_as_json(analysis: Analysis) -> str:
-    """JSON text of an analysis, as docs/analysis.md describes it; NaN becomes null."""
+def analysis_content(analysis: Analysis) -> dict[str, Any]:
+    """Plain values of an analysis, as docs/analysis.md describes its JSON; NaN becomes null."""
     frf, poles = analysis.frf, analysis.poles
-    content = {
+    return {
         "frf": {
             "frequency_hz": frf.frequency_hz.tolist(),
             "real": [known(value) for value in frf.g.real],
@@ -231,7 +230,6 @@ def analysis_as_json(analysis: Analysis) -> str:
         "warnings": list(analysis.warnings),
         "timing_s": analysis.timing_s,
     }
-    return json.dumps(content, indent=1, allow_nan=False)
 
 
 def _distortion(distortion: Distortion | None) -> dict | None:

@@ -17,7 +17,7 @@ from tactile_resonance.analysis import (
     POLES_METHODS,
     Analysis,
     analyse,
-    analysis_as_json,
+    analysis_content,
 )
 from tactile_resonance.calibration.file import read_calibration
 from tactile_resonance.calibration.validity import as_of_today
@@ -266,7 +266,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     outputs: dict[Path, bytes] = {}
     if options.json:
-        outputs[options.json] = analysis_as_json(analysis).encode()
+        outputs[options.json] = _json(analysis_content(analysis))
     if options.plot:
         # drawing libraries take half a second to load: only who wants a figure waits for it
         from tactile_resonance.report.drawing import figure_bytes
@@ -362,8 +362,12 @@ def _analyze_contacts(options: argparse.Namespace) -> int:
     if options.json:
         one = len(contents) == 1
         content = next(iter(contents.values())) if one else contents
-        write_whole(options.json, json.dumps(content, indent=1, allow_nan=False).encode())
+        write_whole(options.json, _json(content))
     return 0
+
+
+def _json(content: dict) -> bytes:
+    return json.dumps(content, indent=1, allow_nan=False).encode()
 
 
 def _pressed(

@@ -55,8 +55,6 @@ def frf_of_record(
     *,
     sample_rate_hz: float,
     method: str = "local polynomial",
-    order: int = 2,
-    dof: int = 6,
 ) -> FRF:
     """FRF with the covariances that the record allows.
 
@@ -70,8 +68,6 @@ def frf_of_record(
     method : {"local polynomial", "average"}
         How the transient is dealt with: estimated and removed, or waited for: ``average`` drops the
         first of three periods or more. A single period is taken as settled by either.
-    order, dof : int
-        See `spectra.transient_free_spectra`.
 
     Returns
     -------
@@ -84,7 +80,7 @@ def frf_of_record(
     ValueError
         For another method, or shapes that do not fit.
     """
-    spectra = mean_spectra(record, harmonics, method=method, order=order, dof=dof)
+    spectra = mean_spectra(record, harmonics, method=method)
     return frf_of_realisations(spectra, sample_rate_hz=sample_rate_hz)
 
 
@@ -261,21 +257,21 @@ class Agreement:
     ----------
     gain : (batch, M, M) complex
         ``gain[m, n]``: response of m in units of that of n; 1 where they agree.
-    opposed : (batch, M, M) bool
-        Coherent, but of another phase.
-    unequal : (batch, M, M) bool
-        Coherent, but of another gain.
+    pairs : (batch, M, M) bool
+        Coherent, but of another phase or gain.
     apart : (batch, M) bool
         Without coherence with any other realisation, two of which are coherent.
     unlike : (batch,) bool
         None coherent with any other, and noise is no reason for it.
+    of_no_system : (batch,) bool
+        Unlike, or of another phase: the mean of the responses says nothing.
     """
 
     gain: ComplexArray
-    opposed: BoolArray
-    unequal: BoolArray
+    pairs: BoolArray
     apart: BoolArray
     unlike: BoolArray
+    of_no_system: BoolArray
 
     @classmethod
     def of(
@@ -325,17 +321,13 @@ class Agreement:
             spread = (1 - ALIKE) * np.sqrt(2 * ALIKE / (lines[:, 0, 0] * max(records - 1, 1)))
             low = (mean < ALIKE - 3 * spread) & ~(coherent & others).any(axis=(1, 2))
             unlike = low & (differ > ABOVE_NOISE)
-        return cls(gain, opposed, unequal, _apart(h, coherence, coherent, lines), unlike)
+        apart = _apart(h, coherence, coherent, lines)
+        return cls(gain, opposed | unequal, apart, unlike, opposed.any(axis=(1, 2)) | unlike)
 
     @property
     def contradiction(self) -> BoolArray:
         """(batch,) whether the records are not of one system."""
-        return np.asarray(self._pairs.any(axis=(1, 2)) | self.apart.any(axis=-1) | self.unlike)
-
-    @property
-    def of_no_system(self) -> BoolArray:
-        """(batch,) whether the mean of the responses says nothing."""
-        return np.asarray(self.opposed.any(axis=(1, 2)) | self.unlike)
+        return np.asarray(self.pairs.any(axis=(1, 2)) | self.apart.any(axis=-1) | self.unlike)
 
     def remarks(self) -> npt.NDArray[np.object_]:
         """(batch,) what contradicts, for people; empty where nothing does."""
@@ -345,17 +337,13 @@ class Agreement:
             remarks[k] = self._remark(int(k))
         return remarks
 
-    @property
-    def _pairs(self) -> BoolArray:
-        return self.opposed | self.unequal
-
     def _remark(self, k: int) -> str:
         if self.unlike[k]:
             return (
                 "the responses of the realisations have nothing in common, which noise does not explain: "
                 "actuator and sensor are of different records, or distortion is larger than the response"
             )
-        pairs, apart = self._pairs[k], np.flatnonzero(self.apart[k])
+        pairs, apart = self.pairs[k], np.flatnonzero(self.apart[k])
         records = np.arange(len(pairs))
         if apart.size:
             names = " and ".join(str(m + 1) for m in apart)

@@ -158,7 +158,7 @@ def mean_spectra(
     order: int = 2,
     dof: int = 6,
 ) -> PeriodicSpectra:
-    """Mean spectra (..., 2, F) of a record; parameters are those of `estimate.frf_of_record`."""
+    """Mean spectra (..., 2, F) of a record; see `estimate.frf_of_record` and `transient_free_spectra`."""
     if method not in METHODS:
         raise ValueError(f"method: {method!r}, accepted are {', '.join(METHODS)}")
     if record.periods > 1 and method == "local polynomial":
