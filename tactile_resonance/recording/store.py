@@ -261,29 +261,19 @@ def _check_name(path: Path, found: tuple[int, ...], named: tuple[int, ...]) -> N
         raise ValueError(f"{path.name}: holds what belongs to {found}, its name says {named}")
 
 
-def read_store_recording(
-    folder: Path, measurement_id: int | None = None, periods: int | None = None
-) -> Recording:
-    """One measurement of a store, ready for analysis.
+def read_measurement(folder: Path, measurement_id: int | None = None) -> StoredMeasurement:
+    """One measurement of a store, ready for `recording_of`.
 
     Parameters
     ----------
     folder : Path
     measurement_id : int, optional
         Which one; not needed where there is only one.
-    periods : int, optional
-        Use the first this many of each realisation; when absent all that were planned, or as many as the
-        longest one has where the measurement ended before.
-
-    Returns
-    -------
-    Recording
-        Realisations of which every period is there; its notes name what was left out.
 
     Raises
     ------
     ValueError
-        If the measurement is not named or not there, or no realisation has the periods wanted, or any.
+        If the measurement is not named or not there.
     OSError
         If the folder cannot be listed.
     """
@@ -291,16 +281,25 @@ def read_store_recording(
     if not entries:
         found = f" ({'; '.join(problems[:3])})" if problems else ""
         raise ValueError(f"{folder}: no measurement in it, expected a folder of records{found}")
-    return recording_of(choose(entries, measurement_id, folder).read(), periods)
+    return choose(entries, measurement_id, folder).read()
 
 
 def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> Recording:
-    """A measurement that was read, as `read_store_recording` gives it.
+    """A measurement that was read, ready for analysis; realisations of which every period is there.
+
+    Its notes name what was left out.
+
+    Parameters
+    ----------
+    measurement : StoredMeasurement
+    periods : int, optional
+        Use the first this many of each realisation; when absent all that were planned, or as many as the
+        longest one has where the measurement ended before.
 
     Raises
     ------
     ValueError
-        If no realisation has the periods asked for, or any.
+        If no realisation has the periods wanted, or any.
     """
     key = measurement.measurement_id
     if not measurement.excitations:
