@@ -86,13 +86,7 @@ class Excitation:
                 accepted = {"i": "signed integers", "f": "real numbers"}[kind]
                 raise ValueError(f"{name}: values of type {given}, expected {accepted}")
         _check_period(self.sample_rate_hz, self.samples_per_period)
-        harmonics, last = self.harmonics, (self.samples_per_period - 1) // 2
-        if harmonics.ndim != 1 or harmonics.size == 0:
-            raise ValueError(f"harmonics: shape {harmonics.shape}, expected (F,) with F >= 1")
-        if harmonics[0] < 1 or harmonics[-1] > last or np.any(np.diff(harmonics) < 1):
-            raise ValueError(
-                f"harmonics: {harmonics[0]}..{harmonics[-1]}, expected ascending, from 1 to {last}"
-            )
+        checked_harmonics(self.harmonics, self.samples_per_period)
         for name in ("amplitude_v", "phase_rad"):
             array = getattr(self, name)
             if array.shape != self.harmonics.shape or not np.all(np.isfinite(array)):
@@ -134,6 +128,23 @@ class Excitation:
         if self.level_v == 0:
             return float("nan")
         return float(np.max(np.abs(self.period())) / self.level_v)
+
+
+def checked_harmonics(harmonics: npt.ArrayLike, samples_per_period: int) -> IntArray:
+    """(F,) int harmonics, read-only; ValueError unless ascending within 1..(N - 1) // 2."""
+    array = np.array(harmonics)
+    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"harmonics: {array.dtype} of shape {array.shape}, expected (F,) integers, F >= 1"
+        )
+    array = array.astype(np.int64)
+    last = (samples_per_period - 1) // 2
+    if array[0] < 1 or array[-1] > last or np.any(np.diff(array) < 1):
+        raise ValueError(
+            f"harmonics: {array.min()}..{array.max()}, expected ascending, within 1..{last}"
+        )
+    array.flags.writeable = False
+    return array
 
 
 def harmonics_on_grid(

@@ -19,6 +19,7 @@ import numpy.typing as npt
 import scipy.fft
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
+from tactile_resonance.multisine import checked_harmonics
 
 METHODS = ("local polynomial", "average")
 _NOT_FINITE = "u, y: samples are not finite, expected a complete record"
@@ -131,23 +132,6 @@ class PeriodicSpectra:
             spectra=self.spectra[..., where],
             covariance=None if self.covariance is None else self.covariance[..., where],
         )
-
-
-def checked_harmonics(harmonics: npt.ArrayLike, samples_per_period: int) -> IntArray:
-    """(F,) int harmonics, read-only; ValueError unless ascending within 1..(N - 1) // 2."""
-    array = np.array(harmonics)
-    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "iu":
-        raise ValueError(
-            f"harmonics: {array.dtype} of shape {array.shape}, expected (F,) integers, F >= 1"
-        )
-    array = array.astype(np.int64)
-    last = (samples_per_period - 1) // 2
-    if array[0] < 1 or array[-1] > last or np.any(np.diff(array) < 1):
-        raise ValueError(
-            f"harmonics: {array.min()}..{array.max()}, expected ascending, within 1..{last}"
-        )
-    array.flags.writeable = False
-    return array
 
 
 def mean_spectra(
