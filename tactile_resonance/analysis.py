@@ -148,7 +148,7 @@ def analyse(
         if suspicion is not None:
             warnings.append(f"frf: {suspicion.message}")
     if band_hz is None:
-        band_hz = strongest_resonance_band(frf)
+        band_hz = _strongest_resonance_band(frf)
         warnings.append(
             f"band: chosen around the strongest resonance, {band_hz[0]:g}-{band_hz[1]:g} Hz"
         )
@@ -263,20 +263,9 @@ FEWEST_LINES_EACH_SIDE = 20
 GAP = 10.0
 
 
-def strongest_resonance_band(frf: FRF) -> tuple[float, float]:
+def _strongest_resonance_band(frf: FRF) -> tuple[float, float]:
     """Band around the line where the response moves fastest along its arc, within one stretch of lines.
 
-    Parameters
-    ----------
-    frf : FRF
-        With (F,) arrays, F at least 10.
-
-    Returns
-    -------
-    (low_hz, high_hz)
-
-    Notes
-    -----
     Kennedy & Pancu (J. Aeronaut. Sci. 14 (1947) 603-625): near a resonance G runs through a circle,
     and ``|dG/df|``, proportional to ``1 / ((f - f0)^2 + (damping f0)^2)``, is largest at the
     resonance whatever the other modes add. It is averaged over five lines against noise.

@@ -266,7 +266,7 @@ def design_multisine(
     relative_amplitude : (F,) array, optional
         Shape of the amplitude over the excited lines; flat when absent.
     sweep : bool
-        Phases of a rising sweep over each period in place of random ones (`sweep_phases`): of one realisation.
+        Phases of a rising sweep over each period in place of random ones: of one realisation.
     seed, realisation, realisations, periods, measurement_id, excitation_id, label, bands
         See `Excitation`.
 
@@ -346,7 +346,7 @@ def design_multisine(
     require(realisations == 1 or not sweep, "realisations", realisations, accepted)
     phase = np.random.default_rng([seed, 1, realisation]).uniform(0, 2 * np.pi, harmonics.size)
     if sweep:
-        phase = sweep_phases(harmonics, shape)
+        phase = _sweep_phases(harmonics, shape)
     unscaled = Excitation(
         harmonics=harmonics,
         amplitude_v=shape,
@@ -368,16 +368,10 @@ def design_multisine(
     return replace(unscaled, amplitude_v=shape * (level_v / present_v))
 
 
-def sweep_phases(harmonics: IntArray, amplitude: FloatArray) -> FloatArray:
+def _sweep_phases(harmonics: IntArray, amplitude: FloatArray) -> FloatArray:
     """(F,) phases [rad] with which lines sound one after the other over a period, from low to high.
 
     Each has the time that its part of the power takes (Schroeder, IEEE Trans. Inf. Theory 16 (1970) 85-89).
-
-    Parameters
-    ----------
-    harmonics : (F,) int
-        Ascending.
-    amplitude : (F,) float
     """
     power = amplitude**2 / np.sum(amplitude**2)
     delay = np.cumsum(power) - power / 2  # of each line, in periods: minus the slope of its phase
