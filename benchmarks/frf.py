@@ -18,10 +18,14 @@ import scipy.fft
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.frf.estimate import frf_of_realisations, frf_of_record
-from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import (
+    Spectrum,
+    averaged_spectra,
+    mean_spectra,
+    transient_free_spectra,
+)
 from tactile_resonance.multisine import Excitation, design_multisine
 from tactile_resonance.record import Channel, Record
 
@@ -205,8 +209,8 @@ def measure_accuracy(
             for skip in (0, 1)
         }
         for order in (2, 4, 6):
-            estimates[f"fast, order {order}"] = frf_of_record(
-                record, lines, sample_rate_hz=RATE_HZ, order=order
+            estimates[f"fast, order {order}"] = frf_of_realisations(
+                mean_spectra(record, lines, order=order), sample_rate_hz=RATE_HZ
             )
         halves = [p.records(rng, PERIODS // 2) for p in plants]
         u, y = (np.stack(channel) for channel in zip(*halves, strict=True))

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.hostile_run import BAND_HZ, make_run
 from tactile_resonance.record import Channel, Record
 from tactile_resonance.recording.recording import read_recording
-from tactile_resonance.recording.stored_file import read_stored, write_stored
+from tactile_resonance.recording.store import read_stored, write_stored
 from tactile_resonance.scan.kept_bins import NAME, kept_bins
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.run_content import INDEX, RECORDING, read_run

@@ -37,7 +37,7 @@ from tactile_resonance.fields import read_file
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.record import Channel, Record
 from tactile_resonance.recording.recording import read_recording
-from tactile_resonance.recording.stored_file import read_stored, write_stored
+from tactile_resonance.recording.store import read_stored, write_stored
 from tactile_resonance.scan.kept_bins import NAME, kept_bins
 from tactile_resonance.scan.labels import read_labels
 from tactile_resonance.scan.point_file import read_content

@@ -22,8 +22,7 @@ from benchmarks.poles_plant import Plant, judge
 from benchmarks.stability_cells import cells
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.commands.benchmark import NAMES
-from tactile_resonance.frf.local_polynomial import transient_free_spectra
-from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.frf.spectra import Spectrum, transient_free_spectra
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.report.drawing import new_figure, save_figure

@@ -22,9 +22,8 @@ from benchmarks.poles_plant import (
     Plant,
 )
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.frf.spectra import error_variance, power, ratio
+from tactile_resonance.frf.spectra import error_variance, power, ratio, transient_free_spectra
 from tactile_resonance.poles.identify import identify_batch, identify_frf
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.result import PolesBatch

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole recording to FRF and poles, through the functions the nodes use, and its JSON."""
+"""A whole recording to FRF and poles, through the functions the nodes use, and the content of its JSON."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,12 +12,11 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import band, known, number, require, require_kind
-from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.distortion import Distortion, estimate_distortion
 from tactile_resonance.frf.estimate import frf_of_record, with_narrow_modes_judged
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.faults import FaultReport, find_faults
-from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.result import FRF, band_bins
 from tactile_resonance.frf.skew import correct_skew, suspected_skew
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.estimator import POLES_METHODS, choose_among, poles_of_frf
@@ -141,9 +139,7 @@ def analyse(
         warnings.append(f"excited lines found from the input spectrum: {harmonics.size}")
     found = time.perf_counter()
     frf = frf_of_record(record, harmonics, sample_rate_hz=rate_hz, method=frf_method)
-    faults = find_faults(
-        record, sample_rate_hz=rate_hz, harmonics=harmonics, transient_removed=record.periods > 1
-    )
+    faults = find_faults(record, sample_rate_hz=rate_hz, harmonics=harmonics)
     estimated = time.perf_counter()
     if channel_delay_s:
         frf = correct_skew(frf, channel_delay_s)
@@ -152,7 +148,7 @@ def analyse(
         if suspicion is not None:
             warnings.append(f"frf: {suspicion.message}")
     if band_hz is None:
-        band_hz = strongest_resonance_band(frf)
+        band_hz = _strongest_resonance_band(frf)
         warnings.append(
             f"band: chosen around the strongest resonance, {band_hz[0]:g}-{band_hz[1]:g} Hz"
         )
@@ -195,10 +191,10 @@ def analyse(
     )
 
 
-def analysis_as_json(analysis: Analysis) -> str:
-    """JSON text of an analysis, as docs/analysis.md describes it; NaN becomes null."""
+def analysis_content(analysis: Analysis) -> dict[str, Any]:
+    """Plain values of an analysis, as docs/analysis.md describes its JSON; NaN becomes null."""
     frf, poles = analysis.frf, analysis.poles
-    content = {
+    return {
         "frf": {
             "frequency_hz": frf.frequency_hz.tolist(),
             "real": [known(value) for value in frf.g.real],
@@ -234,7 +230,6 @@ def analysis_as_json(analysis: Analysis) -> str:
         "warnings": list(analysis.warnings),
         "timing_s": analysis.timing_s,
     }
-    return json.dumps(content, indent=1, allow_nan=False)
 
 
 def _distortion(distortion: Distortion | None) -> dict | None:
@@ -268,20 +263,9 @@ FEWEST_LINES_EACH_SIDE = 20
 GAP = 10.0
 
 
-def strongest_resonance_band(frf: FRF) -> tuple[float, float]:
+def _strongest_resonance_band(frf: FRF) -> tuple[float, float]:
     """Band around the line where the response moves fastest along its arc, within one stretch of lines.
 
-    Parameters
-    ----------
-    frf : FRF
-        With (F,) arrays, F at least 10.
-
-    Returns
-    -------
-    (low_hz, high_hz)
-
-    Notes
-    -----
     Kennedy & Pancu (J. Aeronaut. Sci. 14 (1947) 603-625): near a resonance G runs through a circle,
     and ``|dG/df|``, proportional to ``1 / ((f - f0)^2 + (damping f0)^2)``, is largest at the
     resonance whatever the other modes add. It is averaged over five lines against noise.

@@ -20,7 +20,7 @@ from typing import TextIO
 
 import numpy as np
 
-from tactile_resonance.fields import cut
+from tactile_resonance.fields import cut, one_line
 
 Arrays = Mapping[str, np.ndarray]
 ACCEPTED = ".npz, .mat and .csv"
@@ -97,7 +97,7 @@ def _read_npz(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
             arrays = {name: _array(archive, info) for name, info in held.items()}
         return {name: a for name, a in arrays.items() if a.dtype.kind in _NUMBERS}, list(members)
     except Exception as error:  # whatever zipfile and numpy meet in a damaged file
-        raise ValueError(f"{path.name}: no .npz record ({_reason(error)})") from error
+        raise ValueError(f"{path.name}: no .npz record ({one_line(error)[:120]})") from error
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
@@ -169,7 +169,7 @@ def _read_csv(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
             columns = np.loadtxt(chain([first], lines), delimiter=dialect.delimiter, ndmin=2)
     except (csv.Error, ValueError, StopIteration) as error:
         raise ValueError(
-            f"{path.name}: no .csv record ({_reason(error)}); expected a header line with the names "
+            f"{path.name}: no .csv record ({one_line(error)[:120]}); expected a header line with the names "
             "of the columns, then numbers"
         ) from error
     if columns.shape[1] != len(names):
@@ -195,7 +195,3 @@ def _lines(file: TextIO) -> Iterator[str]:
             raise ValueError(f"a line of {_LONGEST_LINE} characters or more")
         if line.strip():
             yield line
-
-
-def _reason(error: BaseException) -> str:
-    return str(error).strip().split("\n")[0][:120] or type(error).__name__

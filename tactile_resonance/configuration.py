@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 PACKAGE_NAME = "tactile_resonance"
@@ -37,7 +36,9 @@ def share_path(relative: str | Path) -> Path:
             f"relative: got {str(relative)!r}; accepted is a path inside the share directory, "
             "such as 'config/tissues.yaml'"
         )
-    candidates = [root / relative for root in _share_roots()]
+    prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
+    installed = [Path(prefix) / "share" / PACKAGE_NAME for prefix in prefixes]
+    candidates = [root / relative for root in (Path(__file__).resolve().parent.parent, *installed)]
     for candidate in candidates:
         if candidate.exists():
             return candidate
@@ -66,11 +67,3 @@ def shared_file(path: Path, folder: str) -> Path:
         return share_path(Path(folder) / path)
     except FileNotFoundError:
         raise ValueError(f"{path}: neither a file here nor one of {folder}") from None
-
-
-def _share_roots() -> Iterator[Path]:
-    yield Path(__file__).resolve().parent.parent
-    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        if prefix:
-            yield Path(prefix) / "share" / PACKAGE_NAME
-    yield Path(sys.prefix) / "share" / PACKAGE_NAME

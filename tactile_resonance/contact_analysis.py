@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tactile_resonance.analysis import Analysis, analyse, analysis_as_json
+from tactile_resonance.analysis import Analysis, analyse, analysis_content
 from tactile_resonance.calibration.contact import ContactStatus, Law, Moduli, TissueContact, moduli
 from tactile_resonance.calibration.estimator import CalibratedEstimator, ContactRecord
 from tactile_resonance.calibration.model import CalibratedSensor, read_calibration
@@ -168,8 +167,8 @@ def estimate_contact(
 def contact_content(analysis: ContactAnalysis) -> dict[str, Any]:
     """Plain values of an analysis, as docs/calibration.md describes its JSON; null where unknown."""
     contact, found = analysis.contact, analysis.moduli
-    main = contact.poles.main
-    content: dict[str, Any] = {
+    main, black_box = contact.poles.main, analysis.black_box
+    return {
         "stiffness_n_per_m": [contact.stiffness_n_per_m.real, contact.stiffness_n_per_m.imag],
         "stiffness_covariance": contact.stiffness_covariance.tolist(),
         "stiffness_total_covariance": contact.stiffness_total.tolist(),
@@ -188,9 +187,6 @@ def contact_content(analysis: ContactAnalysis) -> dict[str, Any]:
             **{name: known(value) for name, value in asdict(found).items() if isinstance(value, float)},
             "status": found.status.value,
         },
-        "black_box": None,
+        "black_box": None if black_box is None else analysis_content(black_box),
         "warnings": list(analysis.warnings),
     }
-    if analysis.black_box is not None:
-        content["black_box"] = json.loads(analysis_as_json(analysis.black_box))
-    return content

@@ -22,7 +22,7 @@ from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording, read_recording
-from tactile_resonance.recording.store import read_store_recording, recording_of
+from tactile_resonance.recording.store import read_measurement, recording_of
 
 if TYPE_CHECKING:
     from tactile_resonance.scan.run_content import RunContent
@@ -88,7 +88,7 @@ def read_record(
     for name in fields:
         raise ValueError(f"{name}: only for a file; {path} is a folder, whose records say it")
     if not (path / "run.json").is_file():
-        return read_store_recording(path, measurement_id, periods)
+        return recording_of(read_measurement(path, measurement_id), periods)
     try:
         from tactile_resonance.scan.recorded import read_recorded
     except ImportError as error:

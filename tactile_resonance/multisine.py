@@ -86,13 +86,7 @@ class Excitation:
                 accepted = {"i": "signed integers", "f": "real numbers"}[kind]
                 raise ValueError(f"{name}: values of type {given}, expected {accepted}")
         _check_period(self.sample_rate_hz, self.samples_per_period)
-        harmonics, last = self.harmonics, (self.samples_per_period - 1) // 2
-        if harmonics.ndim != 1 or harmonics.size == 0:
-            raise ValueError(f"harmonics: shape {harmonics.shape}, expected (F,) with F >= 1")
-        if harmonics[0] < 1 or harmonics[-1] > last or np.any(np.diff(harmonics) < 1):
-            raise ValueError(
-                f"harmonics: {harmonics[0]}..{harmonics[-1]}, expected ascending, from 1 to {last}"
-            )
+        checked_harmonics(self.harmonics, self.samples_per_period)
         for name in ("amplitude_v", "phase_rad"):
             array = getattr(self, name)
             if array.shape != self.harmonics.shape or not np.all(np.isfinite(array)):
@@ -136,6 +130,23 @@ class Excitation:
         return float(np.max(np.abs(self.period())) / self.level_v)
 
 
+def checked_harmonics(harmonics: npt.ArrayLike, samples_per_period: int) -> IntArray:
+    """(F,) int harmonics, read-only; ValueError unless ascending within 1..(N - 1) // 2."""
+    array = np.array(harmonics)
+    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"harmonics: {array.dtype} of shape {array.shape}, expected (F,) integers, F >= 1"
+        )
+    array = array.astype(np.int64)
+    last = (samples_per_period - 1) // 2
+    if array[0] < 1 or array[-1] > last or np.any(np.diff(array) < 1):
+        raise ValueError(
+            f"harmonics: {array.min()}..{array.max()}, expected ascending, within 1..{last}"
+        )
+    array.flags.writeable = False
+    return array
+
+
 def harmonics_on_grid(
     low: int, high: int, grid: Grid, *, seed: int = 0, block_lines: int = 4
 ) -> IntArray:
@@ -168,8 +179,6 @@ def harmonics_on_grid(
     if grid is not Grid.FULL:
         lines = lines[lines % 2 == 1]
     if grid is Grid.ODD_RANDOM:
-        if block_lines < 2:
-            raise ValueError(f"block_lines: {block_lines}, expected at least 2")
         blocks = lines.size // block_lines
         left_out = np.random.default_rng([seed, 0]).integers(block_lines, size=blocks)
         lines = np.delete(lines, np.arange(blocks) * block_lines + left_out)
@@ -257,7 +266,7 @@ def design_multisine(
     relative_amplitude : (F,) array, optional
         Shape of the amplitude over the excited lines; flat when absent.
     sweep : bool
-        Phases of a rising sweep over each period in place of random ones (`sweep_phases`): of one realisation.
+        Phases of a rising sweep over each period in place of random ones: of one realisation.
     seed, realisation, realisations, periods, measurement_id, excitation_id, label, bands
         See `Excitation`.
 
@@ -337,7 +346,7 @@ def design_multisine(
     require(realisations == 1 or not sweep, "realisations", realisations, accepted)
     phase = np.random.default_rng([seed, 1, realisation]).uniform(0, 2 * np.pi, harmonics.size)
     if sweep:
-        phase = sweep_phases(harmonics, shape)
+        phase = _sweep_phases(harmonics, shape)
     unscaled = Excitation(
         harmonics=harmonics,
         amplitude_v=shape,
@@ -359,21 +368,72 @@ def design_multisine(
     return replace(unscaled, amplitude_v=shape * (level_v / present_v))
 
 
-def sweep_phases(harmonics: IntArray, amplitude: FloatArray) -> FloatArray:
+def _sweep_phases(harmonics: IntArray, amplitude: FloatArray) -> FloatArray:
     """(F,) phases [rad] with which lines sound one after the other over a period, from low to high.
 
     Each has the time that its part of the power takes (Schroeder, IEEE Trans. Inf. Theory 16 (1970) 85-89).
-
-    Parameters
-    ----------
-    harmonics : (F,) int
-        Ascending.
-    amplitude : (F,) float
     """
     power = amplitude**2 / np.sum(amplitude**2)
     delay = np.cumsum(power) - power / 2  # of each line, in periods: minus the slope of its phase
     cycles = np.cumsum(delay * np.diff(harmonics, prepend=harmonics[0]))
     return np.asarray(-2 * np.pi * cycles % (2 * np.pi))
+
+
+# Clip level over the passes, relative to the present peak: gentle clipping late keeps what was won.
+FIRST_CLIP, LAST_CLIP = 0.75, 0.99
+
+
+def compress_crest_factor(excitation: Excitation, *, passes: int = 300) -> Excitation:
+    """The same lines and amplitudes with phases that make the peaks small.
+
+    Parameters
+    ----------
+    excitation : Excitation
+        A single realisation.
+    passes : int
+        Clipping passes; each costs two FFTs of a period.
+
+    Returns
+    -------
+    Excitation
+        With ``random_phases`` False and the smallest crest factor of all passes.
+
+    Raises
+    ------
+    ValueError
+        If the excitation is one of several realisations: phases are then no longer random, and the
+        scatter over realisations says nothing of nonlinear distortion.
+
+    Notes
+    -----
+    Signal and spectrum are made to fit in turn: the signal is clipped, its spectrum keeps the new phases
+    and takes back the amplitudes wanted (Van der Ouderaa, Schoukens, Renneboog, IEEE Trans. Instrum.
+    Meas. 37 (1988) 145-147).
+    """
+    if excitation.realisations > 1:
+        raise ValueError(
+            f"realisations: {excitation.realisations}, compressed phases are not random, so several "
+            "realisations would not show nonlinear distortion; accepted is 1"
+        )
+    if passes < 1:
+        raise ValueError(f"passes: {passes}, expected at least 1")
+    n = excitation.samples_per_period
+    lines, amplitude = excitation.harmonics, excitation.amplitude_v
+    spectrum = np.zeros(n // 2 + 1, complex)
+    phasor = np.exp(1j * excitation.phase_rad)
+    best, smallest = phasor, np.inf
+    for clip in np.linspace(FIRST_CLIP, LAST_CLIP, passes):
+        spectrum[lines] = 0.5 * amplitude * phasor
+        signal = np.fft.irfft(spectrum, n, norm="forward")
+        peak = float(np.max(np.abs(signal)))
+        if peak < smallest:
+            best, smallest = phasor, peak
+        np.clip(signal, -clip * peak, clip * peak, out=signal)
+        clipped = np.fft.rfft(signal)[lines]
+        size = np.abs(clipped)
+        # a line that clipping removed keeps the phase it had
+        phasor = np.where(size > 0, clipped / np.where(size > 0, size, 1.0), phasor)
+    return replace(excitation, phase_rad=np.angle(best), random_phases=False)
 
 
 def _stretches(band_hz: Any, most_hz: float) -> list[tuple[float, float]]:

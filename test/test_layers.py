@@ -14,7 +14,7 @@ TOOLS = {
 }
 CORE = {
     *("calibration", "contact", "frf", "mechanics", "poles", "tissue"),
-    *("cantilever", "crest_factor", "multisine", "record", "sensor", "silent", "tones"),
+    *("cantilever", "multisine", "record", "sensor", "tones"),
 }
 MAY_IMPORT = {
     **dict.fromkeys(TOOLS, TOOLS),

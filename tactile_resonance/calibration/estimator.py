@@ -30,8 +30,7 @@ from tactile_resonance.calibration.contact import (
 )
 from tactile_resonance.calibration.model import Calibration, ContactStiffness, SensorModel
 from tactile_resonance.fields import require
-from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF, BandBins, FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.poles.result import (

@@ -17,7 +17,7 @@ from tactile_resonance.analysis import (
     POLES_METHODS,
     Analysis,
     analyse,
-    analysis_as_json,
+    analysis_content,
 )
 from tactile_resonance.calibration.model import read_calibration
 from tactile_resonance.calibration.validity import as_of_today
@@ -25,12 +25,12 @@ from tactile_resonance.commands.options import add_band, add_figure, add_file, a
 from tactile_resonance.contact_analysis import ContactAnalysis, contact_content, estimate_contact
 from tactile_resonance.fields import band, require
 from tactile_resonance.files import write_whole
-from tactile_resonance.frf.estimate import METHODS
+from tactile_resonance.frf.spectra import METHODS
 from tactile_resonance.front import FIELDS, read_record, read_run
 from tactile_resonance.poles.estimator import CANDIDATES
 from tactile_resonance.poles.structure import DEFAULT_RESIDUAL_TERMS, ModelStructure
 from tactile_resonance.recording.recording import Recording
-from tactile_resonance.silent import check_undriven, silent_record
+from tactile_resonance.tones import check_undriven, silent_record
 
 if TYPE_CHECKING:
     from tactile_resonance.scan.run_content import RunContent
@@ -266,7 +266,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     outputs: dict[Path, bytes] = {}
     if options.json:
-        outputs[options.json] = analysis_as_json(analysis).encode()
+        outputs[options.json] = _json(analysis_content(analysis))
     if options.plot:
         # drawing libraries take half a second to load: only who wants a figure waits for it
         from tactile_resonance.report.drawing import draw_analysis, draw_distortion, figure_bytes
@@ -359,8 +359,12 @@ def _analyze_contacts(options: argparse.Namespace) -> int:
     if options.json:
         one = len(contents) == 1
         content = next(iter(contents.values())) if one else contents
-        write_whole(options.json, json.dumps(content, indent=1, allow_nan=False).encode())
+        write_whole(options.json, _json(content))
     return 0
+
+
+def _json(content: dict) -> bytes:
+    return json.dumps(content, indent=1, allow_nan=False).encode()
 
 
 def _pressed(

@@ -14,8 +14,9 @@ from tactile_resonance.fields import require
 STEPPED = tuple(
     f"tactile_resonance.{name}"
     for name in (
-        *("contact.contact_filter", "simulation.cell.transducer", "simulation.tissue.indenter"),
-        *(f"simulation.ur5e.{name}" for name in ("forces", "kinematics", "poses", "tracking")),
+        *("contact.contact_filter", "simulation.cell.transducer"),
+        *("simulation.noise", "simulation.tissue.indenter"),
+        *(f"simulation.ur5e.{name}" for name in ("forces", "kinematics", "poses")),
     )
 )
 """Modules of what is stepped hundreds of times a second, compiled as they are imported."""

@@ -11,9 +11,8 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.frf.estimate import mean_spectra
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, error_variance
+from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, error_variance, mean_spectra
 from tactile_resonance.multisine import Grid
 
 DETECTING = (Grid.ODD, Grid.ODD_RANDOM)
@@ -186,7 +185,7 @@ def nonlinear_distortion(
     ----------
     spectra : PeriodicSpectra
         At all harmonics of interest, excited or not, (..., M, 2, H): from
-        `spectra.averaged_spectra` in steady state or `local_polynomial.transient_free_spectra` (which
+        `averaged_spectra` in steady state or `transient_free_spectra` (which
         leaves harmonics alone when it estimates noise).
     excited_harmonics : (F,) int
         Odd harmonics, part of `spectra.harmonics`.

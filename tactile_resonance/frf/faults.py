@@ -48,7 +48,6 @@ class FaultKind(Enum):
     OFFSET = "offset"
     DRIFT = "drift"
     HUM = "mains hum"
-    UNSETTLED = "first period not settled"
     CHANNEL_SKEW = "channel skew suspected"
 
 
@@ -118,7 +117,6 @@ def find_faults(
     *,
     sample_rate_hz: float,
     harmonics: npt.NDArray[np.integer],
-    transient_removed: bool = False,
 ) -> FaultReport:
     """Look for acquisition faults in records.
 
@@ -128,9 +126,6 @@ def find_faults(
     sample_rate_hz : float
     harmonics : (F,) int
         Excited lines.
-    transient_removed : bool
-        The FRF comes from a method that removes transients (local polynomial), or the first period
-        is dropped: one that has not settled is then not reported, and a slow drift does no harm.
 
     Returns
     -------
@@ -139,7 +134,8 @@ def find_faults(
     Notes
     -----
     What is looked for, per record: `CHECKS`. A channel skew needs a loop-back measurement
-    (`skew.skew_from_loopback`); from an FRF it can only be suspected (`skew.suspected_skew`).
+    (`skew.skew_from_loopback`); from an FRF it can only be suspected (`skew.suspected_skew`). A first period
+    that has not settled is none, and a slow drift spoils nothing: local polynomials take both out.
     """
     batch = record.samples.ndim - 3
     samples, bins, by_period = (
@@ -158,7 +154,6 @@ def find_faults(
                 by_period[of],
                 sample_rate_hz,
                 np.asarray(harmonics),
-                transient_spoils=not transient_removed,
             )
             # of a channel that lacks samples nothing more can be detected
             checks = CHECKS if channel.complete else (missing_samples,)
@@ -194,7 +189,6 @@ class _Channel:
     by_period: ComplexArray
     sample_rate_hz: float
     harmonics: npt.NDArray[np.integer]
-    transient_spoils: bool
 
     @property
     def periods(self) -> int:
@@ -267,7 +261,7 @@ def drift(x: _Channel) -> Fault | None:
     if spread <= LARGE_DRIFT * float(np.std(x.samples - means[:, None])):
         return None
     text = f"The mean of the {x.name} drifts by {spread:.3g} V over the record"
-    return x.fault(FaultKind.DRIFT, spread, x.transient_spoils, text)
+    return x.fault(FaultKind.DRIFT, spread, False, text)
 
 
 def hum(x: _Channel) -> Fault | None:
@@ -387,29 +381,6 @@ def _coherent(
     return np.asarray(incoherent < chance)
 
 
-def unsettled(x: _Channel) -> Fault | None:
-    """Whether the first period differs from the others by more than noise; needs three periods.
-
-    Not looked for where transients do no harm: records that begin from rest all have one.
-    """
-    periods = x.periods
-    if periods < 3 or not x.transient_spoils:
-        return None
-    spectra = x.by_period[:, x.harmonics]  # (P, F)
-    mean = spectra[1:].mean(axis=0)
-    noise = np.sum(np.abs(spectra[1:] - mean) ** 2) / (periods - 2)
-    difference = np.sum(np.abs(spectra[0] - mean) ** 2) / (1 + 1 / (periods - 1))
-    dof = 2 * x.harmonics.size
-    limit = special.fdtri(dof, dof * (periods - 2), 1 - _FALSE_ALARM)
-    rounding = np.finfo(float).eps ** 2 * np.sum(np.abs(mean) ** 2)
-    # twice the limit: noise of few lines may dominate and vary
-    if difference <= 2 * limit * (noise + rounding):
-        return None
-    level = 10 * np.log10(difference / np.sum(np.abs(mean) ** 2))
-    text = f"The first period of the {x.name} has not settled: {level:.0f} dB off the others"
-    return x.fault(FaultKind.UNSETTLED, 10 ** (level / 20), True, text)
-
-
 def clocks(x: _Channel) -> Fault | None:
     """Periods of the actuator that shift by as much each, their phases in proportion to frequency."""
     if x.name != "actuator" or x.periods < 2 or x.harmonics.size < FEWEST_LINES:
@@ -439,7 +410,7 @@ def clocks(x: _Channel) -> Fault | None:
     return x.fault(FaultKind.CLOCKS, ppm, bool(turned > SPOILING_TURN), text)
 
 
-CHECKS = (missing_samples, saturation, offset, drift, hum, lost_samples, clocks, unsettled)
+CHECKS = (missing_samples, saturation, offset, drift, hum, lost_samples, clocks)
 """What is looked for in each channel."""
 
 

@@ -11,13 +11,12 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.force_spread import joined_spread
-from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
 from tactile_resonance.frf.distortion import DETECTING, distortion_in_band
-from tactile_resonance.frf.estimate import frf_of_realisations, mean_spectra
+from tactile_resonance.frf.estimate import frf_of_realisations
 from tactile_resonance.frf.faults import FaultReport, find_faults, worst_of
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF, BandBins, FrfStatus, band_bins, stacked_bins
 from tactile_resonance.frf.skew import correct_skew
-from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, stacked_spectra
+from tactile_resonance.frf.spectra import PeriodicSpectra, Spectrum, mean_spectra, stacked_spectra
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.record import Contact, Origin, Record
@@ -126,12 +125,8 @@ class MeasurementFrf:
             )
         self._remember(record)
         block = Spectrum.of(u.reshape(-1, n), y.reshape(-1, n))
-        found = find_faults(
-            block,
-            sample_rate_hz=excitation.sample_rate_hz,
-            harmonics=excitation.harmonics,
-            transient_removed=True,
-        )
+        rate_hz, harmonics = excitation.sample_rate_hz, excitation.harmonics
+        found = find_faults(block, sample_rate_hz=rate_hz, harmonics=harmonics)
         self._faults = worst_of([[*self._faults.faults, *found.faults]])
         so_far = self._periods.setdefault(record.realisation, 0)
         if record.block_index * (u.size // n) != so_far:

@@ -16,10 +16,9 @@ from rclpy.node import Node
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.crest_factor import compress_crest_factor
 from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.fields import counted
-from tactile_resonance.multisine import Excitation, Grid, design_multisine
+from tactile_resonance.multisine import Excitation, Grid, compress_crest_factor, design_multisine
 from tactile_resonance.nodes import devices
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread
 from tactile_resonance.nodes.messages import NO_RECORDS, excitation_to_message, record_to_message

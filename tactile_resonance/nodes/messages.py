@@ -22,8 +22,7 @@ from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
-from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.frf.result import FRF, PER_LINE, BandDistortion, FrfStatus
+from tactile_resonance.frf.result import FRF, PER_LINE, BandBins, BandDistortion, FrfStatus
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.poles.structure import PoleBand

@@ -213,7 +213,7 @@ def with_transient_judged(frf: FRF, poles: Poles) -> Poles:
     the mode's width, three at least and a quarter of the band at most, is compared with that of the
     farther half of the band by an F-test. It needs `FRF.sensor_variance_given_actuator`, hence two
     periods; of one period, realisations show a transient by what they differ by (status MODEL_ERROR of the
-    FRF, see `frf.realisations`). Where none is detected half widths below `FEWEST_BINS` are mentioned.
+    FRF, see `frf.estimate`). Where none is detected half widths below `FEWEST_BINS` are mentioned.
 
     Monte Carlo, 30 records a cell of a mode at 250 Hz in 200-300 Hz, lines 2.5 Hz apart, order 2, 2 to 8
     periods, damping ratio .005 to .1, 20 to 80 dB: from rest, mean square errors of f0 over the

@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, IntArray
-from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.frf.result import FRF, FrfStatus
+from tactile_resonance.frf.result import FRF, BandBins, FrfStatus
 from tactile_resonance.poles.drift import poles_with_drift
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator, whole_harmonics

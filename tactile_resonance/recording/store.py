@@ -1,28 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
 """A folder that receives every excitation and record of a device, one file each; its measurements for analysis.
 
+Each is there whole or not at all, and bit-exact:
 ``FOLDER/<number>-<measurement id>/excitation-<realisation>.npz`` and
 ``.../record-<realisation>-<block>.npz``; the number counts the measurements of the folder from 1.
 """
 
 from __future__ import annotations
 
+import io
 import re
 import shutil
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from enum import Enum
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.files import PART, sync
+from tactile_resonance.fields import one_line
+from tactile_resonance.files import PART, sync, write_whole
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Record
 from tactile_resonance.recording.recording import Recording, make_recording
-from tactile_resonance.recording.stored_file import read_stored, write_stored
 
+T = TypeVar("T", Excitation, Record)
+Fields = dict[str, npt.NDArray[Any]]
+
+_FORMAT = "tactile_resonance {} 1"
+_DTYPE = ":dtype"  # suffix of the field that names the integer type an array had
+_DAMAGE = (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError,
+           SyntaxError, MemoryError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 _MEASUREMENT = re.compile(r"(\d+)-(\d+)")
 _EXCITATION = re.compile(r"excitation-(\d+)\.npz")
 _RECORD = re.compile(r"record-(\d+)-(\d+)\.npz")
@@ -247,29 +261,19 @@ def _check_name(path: Path, found: tuple[int, ...], named: tuple[int, ...]) -> N
         raise ValueError(f"{path.name}: holds what belongs to {found}, its name says {named}")
 
 
-def read_store_recording(
-    folder: Path, measurement_id: int | None = None, periods: int | None = None
-) -> Recording:
-    """One measurement of a store, ready for analysis.
+def read_measurement(folder: Path, measurement_id: int | None = None) -> StoredMeasurement:
+    """One measurement of a store, ready for `recording_of`.
 
     Parameters
     ----------
     folder : Path
     measurement_id : int, optional
         Which one; not needed where there is only one.
-    periods : int, optional
-        Use the first this many of each realisation; when absent all that were planned, or as many as the
-        longest one has where the measurement ended before.
-
-    Returns
-    -------
-    Recording
-        Realisations of which every period is there; its notes name what was left out.
 
     Raises
     ------
     ValueError
-        If the measurement is not named or not there, or no realisation has the periods wanted, or any.
+        If the measurement is not named or not there.
     OSError
         If the folder cannot be listed.
     """
@@ -277,16 +281,25 @@ def read_store_recording(
     if not entries:
         found = f" ({'; '.join(problems[:3])})" if problems else ""
         raise ValueError(f"{folder}: no measurement in it, expected a folder of records{found}")
-    return recording_of(choose(entries, measurement_id, folder).read(), periods)
+    return choose(entries, measurement_id, folder).read()
 
 
 def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> Recording:
-    """A measurement that was read, as `read_store_recording` gives it.
+    """A measurement that was read, ready for analysis; realisations of which every period is there.
+
+    Its notes name what was left out.
+
+    Parameters
+    ----------
+    measurement : StoredMeasurement
+    periods : int, optional
+        Use the first this many of each realisation; when absent all that were planned, or as many as the
+        longest one has where the measurement ended before.
 
     Raises
     ------
     ValueError
-        If no realisation has the periods asked for, or any.
+        If no realisation has the periods wanted, or any.
     """
     key = measurement.measurement_id
     if not measurement.excitations:
@@ -303,7 +316,8 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
                 f"measurement {key}: realisation {excitation.realisation + 1} differs from realisation "
                 f"{first.realisation + 1} in sample rate, period or lines, expected the same"
             )
-        blocks = _leading_blocks(measurement, excitation.realisation)
+        mine = [each for each in measurement.records if each.realisation == excitation.realisation]
+        blocks = [each for index, each in enumerate(mine) if each.block_index == index]  # to the first gap
         n = excitation.samples_per_period
         u, y = (
             np.concatenate([np.empty(0, np.float32), *(getattr(b, name).volts() for b in blocks)])
@@ -342,7 +356,120 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
     return replace(recording, notes=tuple(notes))
 
 
-def _leading_blocks(measurement: StoredMeasurement, realisation: int) -> list[Record]:
-    """Blocks of a realisation up to the first gap."""
-    mine = [record for record in measurement.records if record.realisation == realisation]
-    return [record for index, record in enumerate(mine) if record.block_index == index]
+def write_stored(
+    path: Path, value: Excitation | Record, written: Callable[[], None] | None = None
+) -> None:
+    """Write one object durably: a reader, or a power cut, finds the whole file or none.
+
+    Parameters
+    ----------
+    path : Path
+        In a folder that exists; a file of this name is replaced.
+    value : Excitation or Record
+        Each field becomes one array named after it (``origin.contact.force_n``). Integer arrays are
+        held in the smallest signed type that holds them exactly.
+    written : callable, optional
+        See `write_whole`.
+
+    Raises
+    ------
+    ValueError
+        If an array is neither of signed integers nor floating point.
+    OSError
+        If it cannot be written; nothing is left behind, unless `written` was called.
+    """
+    content: Fields = {"format": np.array(_FORMAT.format(type(value).__name__))}
+    _flatten("", value, content)
+    # a damaged zip directory can lose a field without an error
+    content["fields"] = np.array(sorted(content))
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:  # as numpy.savez, in a third of the time less
+        for name, array in content.items():
+            archive.writestr(f"{name}.npy", _header(array.dtype.str, array.shape) + array.tobytes())
+    write_whole(path, buffer.getvalue(), written)
+    sync(path.parent)
+
+
+def read_stored(path: Path, kind: type[T]) -> T:
+    """What `write_stored` wrote.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged or something else; one line that names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            content = {name: archive[name] for name in archive.files}
+        if str(content.get("format")) != _FORMAT.format(kind.__name__):
+            raise ValueError(f"no {kind.__name__} of format 1")
+        if sorted(content.keys() - {"fields"}) != content["fields"].tolist():
+            raise ValueError("a field is lost")
+        return _unflatten("", kind, content)
+    except _DAMAGE as error:
+        reason = one_line(error)[:120]
+        raise ValueError(f"{path.name}: damaged or foreign file ({reason})") from error
+
+
+@lru_cache(maxsize=256)
+def _header(dtype: str, shape: tuple[int, ...]) -> bytes:
+    """What stands before the values of an array of C order in an .npy file."""
+    header = io.BytesIO()
+    described = {"descr": dtype, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(header, described)
+    return header.getvalue()
+
+
+def _flatten(prefix: str, value: Any, content: Fields) -> None:
+    for field in fields(value):
+        name, item = prefix + field.name, getattr(value, field.name)
+        if is_dataclass(item):
+            _flatten(f"{name}.", item, content)
+        elif isinstance(item, tuple) and item and is_dataclass(item[0]):
+            for part in fields(item[0]):
+                content[f"{name}.{part.name}"] = np.array(
+                    [getattr(each, part.name) for each in item]
+                )
+        elif isinstance(item, np.ndarray):
+            content[name] = item
+            if item.dtype.kind == "i":
+                content[name + _DTYPE] = np.array(item.dtype.str)
+                # -1 - n needs as many bits as n
+                low, high = int(item.min(initial=0)), int(item.max(initial=0))
+                content[name] = item.astype(np.min_scalar_type(min(low, -1 - high)))
+            elif item.dtype.kind != "f":
+                raise ValueError(f"{name}: values of type {item.dtype}, expected int or float")
+        elif isinstance(item, Enum):
+            content[name] = np.array(item.value)
+        elif item is not None and item != ():  # no field of what is not there
+            content[name] = np.array(item)
+
+
+def _unflatten(prefix: str, kind: type, content: Mapping[str, npt.NDArray[Any]]) -> Any:
+    hints = get_type_hints(kind)
+    values: dict[str, Any] = {}
+    for field in fields(kind):
+        name, hint = prefix + field.name, hints[field.name]
+        if is_dataclass(hint):
+            values[field.name] = _unflatten(f"{name}.", hint, content)  # type: ignore[arg-type]
+            continue
+        if get_args(hint) and is_dataclass(part := get_args(hint)[0]):  # a tuple of them
+            columns = [
+                content.get(f"{name}.{each.name}", np.empty(0)).tolist() for each in fields(part)
+            ]
+            values[field.name] = tuple(part(*row) for row in zip(*columns, strict=True))  # type: ignore[operator]
+            continue
+        array = content.get(name)
+        if array is None:
+            # a file may be older than the field
+            if field.default is MISSING:
+                raise ValueError(f"{name} is missing")
+        elif name + _DTYPE in content:
+            values[field.name] = array.astype(np.dtype(str(content[name + _DTYPE])), casting="safe")
+        elif array.ndim == 0:
+            is_enum = isinstance(hint, type) and issubclass(hint, Enum)
+            values[field.name] = hint(array.item()) if is_enum else array.item()
+        else:
+            is_tuple = str(field.type).startswith("tuple")
+            values[field.name] = tuple(array.tolist()) if is_tuple else array
+    return kind(**values)

@@ -34,9 +34,9 @@ from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.run_content import RunContent, not_checked
 from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
 from tactile_resonance.scan.tissue_tests import TYPE as TEST_TYPE
-from tactile_resonance.silent import SilentRecord, silent_record
 from tactile_resonance.strict_yaml import parse_yaml
 from tactile_resonance.tissue.classify import UNKNOWN
+from tactile_resonance.tones import SilentRecord, silent_record
 
 if TYPE_CHECKING:
     from tactile_resonance.report.run_map import RunBoundary

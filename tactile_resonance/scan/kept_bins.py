@@ -25,8 +25,8 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.frf.band_bins import BandBins, band_bins
 from tactile_resonance.frf.excited import find_excited_harmonics
+from tactile_resonance.frf.result import BandBins, band_bins
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.recorded import recording_of_point

@@ -14,7 +14,7 @@ from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.record import Channel, Record
-from tactile_resonance.recording.stored_file import read_stored, write_stored
+from tactile_resonance.recording.store import read_stored, write_stored
 
 RATE_HZ, N, PERIODS = 5e3, 2000, 3
 BANDS = (PoleBand(200.0, 300.0), PoleBand(600.0, 800.0, residual_terms=10))

@@ -6,8 +6,7 @@ import pytest
 from scipy import io, signal
 
 from tactile_resonance.frf.distortion import decibel, nonlinear_distortion
-from tactile_resonance.frf.local_polynomial import transient_free_spectra
-from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra, transient_free_spectra
 from tactile_resonance.multisine import Grid, harmonics_on_grid
 
 SILVERBOX_ENDS = (48946, 57646, 66346, 75046, 83746, 92396, 101096, 109796, 118496, 127196)

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from tactile_resonance.frf.estimate import frf_of_record
+from tactile_resonance.frf.estimate import frf_of_realisations, frf_of_record
 from tactile_resonance.frf.result import FrfStatus
-from tactile_resonance.frf.spectra import Spectrum
+from tactile_resonance.frf.spectra import Spectrum, mean_spectra
 from tactile_resonance.multisine import design_multisine
 
 N, RATE_HZ = 1000, 1000.0
@@ -99,7 +99,8 @@ def test_degrees_of_freedom():
     options = {"sample_rate_hz": RATE_HZ, "harmonics": harmonics}
     average = frf_of_record(Spectrum.of(u, y), method="average", **options)
     assert (average.noise_dof, average.periods) == (6 * 2, 3)  # the first period is dropped
-    assert frf_of_record(Spectrum.of(u, y), dof=9, **options).noise_dof >= 6 * 9
+    spectra = mean_spectra(Spectrum.of(u, y), harmonics, dof=9)
+    assert frf_of_realisations(spectra, sample_rate_hz=RATE_HZ).noise_dof >= 6 * 9
 
 
 def test_what_cannot_be_told_is_none(estimate):

@@ -10,8 +10,7 @@ import pytest
 from scipy import signal
 
 from tactile_resonance.frf.estimate import frf_of_realisations
-from tactile_resonance.frf.local_polynomial import transient_free_spectra
-from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra, transient_free_spectra
 
 SIGMAS = 4.0
 RUNS = 200

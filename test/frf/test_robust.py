@@ -7,12 +7,20 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from tactile_resonance.frf import realisations
-from tactile_resonance.frf.estimate import frf_of_realisations, frf_of_record
-from tactile_resonance.frf.local_polynomial import neighbourhoods, transient_free_spectra
-from tactile_resonance.frf.realisations import Agreement, transient_lines
+from tactile_resonance.frf import estimate
+from tactile_resonance.frf.estimate import (
+    Agreement,
+    frf_of_realisations,
+    frf_of_record,
+    transient_lines,
+)
 from tactile_resonance.frf.result import FrfStatus
-from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import (
+    Spectrum,
+    averaged_spectra,
+    neighbourhoods,
+    transient_free_spectra,
+)
 
 SIGMAS = 4.0
 LINES = np.arange(1, 120, 2)
@@ -139,10 +147,10 @@ def test_single_periods_from_rest_are_told_from_settled_ones():
     assert "transient" not in settled.message
 
 
-@pytest.mark.parametrize("false_alarm", [realisations.FALSE_ALARM, 0.02])
+@pytest.mark.parametrize("false_alarm", [estimate.FALSE_ALARM, 0.02])
 @pytest.mark.parametrize("records", [2, 3, 8])
 def test_noise_that_differs_over_lines_is_no_transient(records, false_alarm, monkeypatch):
-    monkeypatch.setattr(realisations, "FALSE_ALARM", false_alarm)
+    monkeypatch.setattr(estimate, "FALSE_ALARM", false_alarm)
     rng = np.random.default_rng(9)
     alarms = 0
     for _ in range(2000):

@@ -9,10 +9,9 @@ from scipy import signal
 
 from tactile_resonance.frf.estimate import frf_of_realisations
 from tactile_resonance.frf.faults import FaultKind
-from tactile_resonance.frf.local_polynomial import transient_free_spectra
 from tactile_resonance.frf.result import PER_LINE
 from tactile_resonance.frf.skew import correct_skew, skew_from_loopback, suspected_skew
-from tactile_resonance.frf.spectra import Spectrum, averaged_spectra
+from tactile_resonance.frf.spectra import Spectrum, averaged_spectra, transient_free_spectra
 
 SAMPLES, RATE = 1000, 10e3
 LINES = np.arange(3, 400)

@@ -14,8 +14,12 @@ serialization = pytest.importorskip("rclpy.serialization")
 msg = pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 from tactile_resonance.contact.force_spread import ForceSpread  # noqa: E402
-from tactile_resonance.frf.band_bins import BandBins  # noqa: E402
-from tactile_resonance.frf.result import FRF, BandDistortion, FrfStatus  # noqa: E402
+from tactile_resonance.frf.result import (  # noqa: E402
+    FRF,
+    BandBins,
+    BandDistortion,
+    FrfStatus,
+)
 from tactile_resonance.multisine import Grid, design_multisine  # noqa: E402
 from tactile_resonance.nodes import messages  # noqa: E402
 from tactile_resonance.poles.result import Poles, PolesStatus  # noqa: E402

@@ -8,9 +8,8 @@ import pytest
 from scipy import signal, stats
 
 from tactile_resonance.analysis import analyse
-from tactile_resonance.frf.band_bins import band_bins
 from tactile_resonance.frf.estimate import frf_of_record
-from tactile_resonance.frf.result import FrfStatus
+from tactile_resonance.frf.result import FrfStatus, band_bins
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles import estimator
 from tactile_resonance.poles.estimator import identify_poles_from_records

@@ -17,8 +17,7 @@ from poles.mode_at_250_hz import (
     spectra,
 )
 
-from tactile_resonance.frf.band_bins import BandBins
-from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.result import FRF, BandBins
 from tactile_resonance.poles.estimator import (
     choose_among,
     identify_poles_from_bins,

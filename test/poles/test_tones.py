@@ -16,7 +16,7 @@ from benchmarks.poles_plant import (
     Plant,
     response,
 )
-from tactile_resonance.frf.band_bins import BandBins
+from tactile_resonance.frf.result import BandBins
 from tactile_resonance.multisine import mains_lines
 from tactile_resonance.poles.estimator import identify_poles_from_bins
 from tactile_resonance.poles.identify import identify_frf

@@ -14,12 +14,21 @@ import numpy as np
 import pytest
 
 from tactile_resonance.record import Channel, Contact, Origin, Record
-from tactile_resonance.recording.store import RecordStore, read_store_recording
-from tactile_resonance.recording.stored_file import read_stored, write_stored
+from tactile_resonance.recording.store import (
+    RecordStore,
+    read_measurement,
+    read_stored,
+    recording_of,
+    write_stored,
+)
 
 sys.path.insert(0, str(Path(__file__).parent))
 import stores
 from stores import assert_same, read_store
+
+
+def recording_in(folder, measurement_id=None, periods=None):
+    return recording_of(read_measurement(folder, measurement_id), periods)
 
 
 def test_everything_comes_back_to_the_bit(tmp_path):
@@ -152,7 +161,7 @@ def test_recording_holds_the_complete_realisations(tmp_path):
     store = RecordStore(tmp_path)
     _, records = stores.write(store, 7, realisations=3, periods=4)
     (folder,) = tmp_path.iterdir()
-    whole = read_store_recording(tmp_path)
+    whole = recording_in(tmp_path)
     assert whole.u.shape == whole.y.shape == (3, 4, stores.SAMPLES)
     assert whole.notes == ()
     for found, record in zip(whole.u.reshape(12, -1), records, strict=True):
@@ -160,11 +169,11 @@ def test_recording_holds_the_complete_realisations(tmp_path):
     np.testing.assert_array_equal(whole.excited_harmonics, stores.excitations()[0].harmonics)
 
     (folder / "record-00001-0000002.npz").unlink()
-    part = read_store_recording(tmp_path)
+    part = recording_in(tmp_path)
     np.testing.assert_array_equal(part.y, whole.y[[0, 2]])
     assert part.notes == ("realisation 2 left out: 2 of 4 consecutive periods are there",)
     # the periods before the gap serve where so many are enough
-    short = read_store_recording(tmp_path, periods=2)
+    short = recording_in(tmp_path, periods=2)
     np.testing.assert_array_equal(short.y, whole.y[:, :2])
     assert short.notes == ()
 
@@ -177,11 +186,11 @@ def test_recording_of_an_early_end(tmp_path):
     for block in range(3):
         store.add_record(stores.record(planned[0], block))
     with pytest.raises(ValueError, match="no complete realisation .*3 of 4 consecutive periods"):
-        read_store_recording(tmp_path, periods=4)
-    recording = read_store_recording(tmp_path, periods=3)
+        recording_in(tmp_path, periods=4)
+    recording = recording_in(tmp_path, periods=3)
     assert recording.u.shape == (1, 3, stores.SAMPLES)
     assert recording.notes == ("1 of 3 realisations were played",)
-    whole = read_store_recording(tmp_path)
+    whole = recording_in(tmp_path)
     np.testing.assert_array_equal(whole.y, recording.y)
     ended = "the measurement ended after 3 of 4 periods"
     assert whole.notes == (ended, "1 of 3 realisations were played")
@@ -189,15 +198,15 @@ def test_recording_of_an_early_end(tmp_path):
 
 def test_one_of_several_measurements_must_be_chosen(tmp_path):
     with pytest.raises(ValueError, match="no measurement in it"):
-        read_store_recording(tmp_path)
+        recording_in(tmp_path)
     store = RecordStore(tmp_path)
     stores.write(store, 12)
     _, records = stores.write(store, 11)
     with pytest.raises(ValueError, match="not given, .* holds 12, 11"):
-        read_store_recording(tmp_path)
+        recording_in(tmp_path)
     with pytest.raises(ValueError, match="measurement_id: 13, .* holds 12, 11"):
-        read_store_recording(tmp_path, 13)
-    found = read_store_recording(tmp_path, 11)
+        recording_in(tmp_path, 13)
+    found = recording_in(tmp_path, 11)
     np.testing.assert_array_equal(found.y[0, 0], records[0].sensor.volts())
 
 

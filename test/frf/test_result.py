@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.frf.band_bins import BandBins, band_bins, stacked_bins
+from tactile_resonance.frf.result import BandBins, band_bins, stacked_bins
 from tactile_resonance.frf.spectra import Spectrum
 
 

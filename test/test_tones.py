@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.cli import main
-from tactile_resonance.silent import silent_record
+from tactile_resonance.tones import silent_record
 
 RATE_HZ, PERIODS, SAMPLES = 5000.0, 8, 2000
 
