@@ -10,7 +10,7 @@ from collections.abc import Callable
 from rclpy.task import Future
 
 from tactile_resonance.clock import Clock
-from tactile_resonance.contact.force_over import ForceRecord
+from tactile_resonance.contact.force_spread import ForceRecord
 from tactile_resonance.contact.goal import TARED, State
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.nodes.managed_node import ManagedNode
