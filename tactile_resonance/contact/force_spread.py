@@ -24,6 +24,7 @@ from itertools import islice
 from operator import itemgetter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
@@ -62,7 +63,9 @@ class ForceSpread:
     max_n: float = math.nan
 
 
-def spread_of(time_s: FloatArray, force_n: FloatArray, length_s: float) -> ForceSpread:
+def spread_of(
+    time_s: NDArray[np.floating], force_n: NDArray[np.floating], length_s: float
+) -> ForceSpread:
     """Spread of the forces heard in an interval.
 
     Parameters

@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import math
 
-from tactile_resonance.contact.envelope import Place
+from tactile_resonance.contact.envelope import Place, inside
 from tactile_resonance.contact.goal import REST, Move, State, failed
-from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.observer import Observer, Zero
+from tactile_resonance.contact.parameters import Workspace
+from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample
-from tactile_resonance.contact.tare import Zero
 from tactile_resonance.contact.tip_path import ARRIVED_RAD, TipPath, TurningWay
 from tactile_resonance.contact.vectors import Vector, added, scaled, vector
 
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
+
+BESIDE_M = 0.05
+"""So far beside the way of a goal the tip may be [m]."""
 
 TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL = 0.01, 8.0
 """Change of the untared force, near the surface, that is a touch [N]; more where so much is noise."""
@@ -60,6 +63,7 @@ class FreeMotion:
         self.begun = False
         self.rest_m = observer.parameters.standoff_m
         self._turning: TurningWay | None = None
+        self._box: Workspace | None = None  # around its way: known with the first state of the arm
         self._travel_force_n: Vector | None = None
         self._still_ns = -1
         self._tare_ns = 0
@@ -83,7 +87,20 @@ class FreeMotion:
             self._turning = TurningWay(self._path, arm, self._parameters, self._limits)
         self.begun = True
 
-    def places(self, arm: ArmSample) -> list[Vector]:
+    def judge_way(self, arm: ArmSample) -> Breach | None:
+        """Whether the tip is near the way of this goal, from where it was first seen."""
+        if self._box is None:
+            axes = list(zip(*self._places(arm), strict=True))
+            low_m = tuple(round(min(axis) - BESIDE_M, 4) for axis in axes)
+            self._box = Workspace(low_m, tuple(round(max(axis) + BESIDE_M, 4) for axis in axes))
+        box = self._box
+        if inside(arm.position_m, box.low_m, box.high_m):
+            return None
+        x, y, z = arm.position_m
+        text = f"tip at {x:.4f}, {y:.4f}, {z:.4f} m, off the way of its goal: {box.low_m} to "
+        return Breach(Cause.WORKSPACE, f"{text}{box.high_m} m")
+
+    def _places(self, arm: ArmSample) -> list[Vector]:
         """Corners of its way, from where the tip is to the deepest place that the limits allow."""
         p, path = self._parameters, self._path
         lift_m = max(0.0, p.standoff_m - path.height_m(arm))

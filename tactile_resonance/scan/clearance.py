@@ -22,8 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.goal import ContactGoal
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.goal import Aim, ContactGoal
 from tactile_resonance.contact.parameters import ContactParameters, Limits, Workspace
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.contact.tip_path import TipPath, TurningWay

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.clock import WallClock
 from tactile_resonance.contact.admission import require_fit
 from tactile_resonance.contact.geometry import TipGeometry, touch_pose
-from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
-from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.geometry import TipGeometry, touch_pose
-from tactile_resonance.contact.goal import ContactGoal
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.goal import Aim, ContactGoal
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.tip_path import ARRIVED_M, ARRIVING_S, RIGHTING_S, TipPath

@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.law import HoldMode
+from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.nodes import scan_hands
 from tactile_resonance.nodes.contact_node import ContactNode
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
