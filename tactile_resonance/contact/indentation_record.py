@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 
+from tactile_resonance.contact.geometry import TipPath
 from tactile_resonance.contact.goal import TOUCHING, ContactGoal, State
 from tactile_resonance.contact.loop import Cycle
 from tactile_resonance.contact.result import ContactResult
-from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 
 RECORDED = (State.APPROACH, *TOUCHING, State.RETRACT)

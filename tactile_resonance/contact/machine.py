@@ -14,8 +14,8 @@ from dataclasses import replace
 from tactile_resonance.contact.admission import check_goal
 from tactile_resonance.contact.contact_filter import ContactEstimate
 from tactile_resonance.contact.envelope import Envelope, Place, is_finite
-from tactile_resonance.contact.free_motion import FreeMotion
-from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.free_motion import FreeMotion, Withdrawal
+from tactile_resonance.contact.geometry import TipGeometry, TipPath
 from tactile_resonance.contact.goal import (
     ENDED,
     REST,
@@ -40,9 +40,7 @@ from tactile_resonance.contact.result import (
     Outcome,
 )
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.contact.tip_path import TipPath
 from tactile_resonance.contact.vectors import Vector, dot
-from tactile_resonance.contact.withdrawal import Withdrawal
 
 RELIEVING = (*TOUCHING, State.RETRACT)
 """States in which force is taken off as fast as it may be."""
