@@ -27,9 +27,8 @@ from tactile_resonance.contact.interfaces import (
     Mount,
     NodeArm,
 )
-from tactile_resonance.contact.payload import Payload
+from tactile_resonance.contact.payload import Mounting, Payload, TipForce
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
-from tactile_resonance.contact.tip_force import Mounting, TipForce
 from tactile_resonance.contact.vectors import Six, rotated_back, turn_from_vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
 from tactile_resonance.fields import (

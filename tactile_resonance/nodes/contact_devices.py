@@ -9,7 +9,7 @@ from pathlib import Path
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.interfaces import CommandLimits, NodeArm
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.contact.payload import TipForce
 from tactile_resonance.drivers.force_config import CanForce, force_source, read_force_config
 from tactile_resonance.drivers.twist import TwistConfig
 from tactile_resonance.drivers.ur_arm import UrArm
