@@ -23,40 +23,6 @@ RECENT, LONGEST_GAP_NS = 64, 200_000_000
 """So many forces are kept for the rate, none from before a longer gap [ns]."""
 
 
-class RunningMean:
-    """Mean over the last time, of values that come one by one.
-
-    Parameters
-    ----------
-    window_ns : int
-    """
-
-    def __init__(self, window_ns: int) -> None:
-        self._window_ns = window_ns
-        self._recent: deque[tuple[int, float]] = deque()
-        self._sum, self._full = 0.0, False
-
-    def clear(self) -> None:
-        """Forget all values."""
-        self._recent.clear()
-        self._sum, self._full = 0.0, False
-
-    def add(self, time_ns: int, value: float) -> None:
-        """Take one more value, later than the others."""
-        recent = self._recent
-        recent.append((time_ns, value))
-        self._sum += value
-        since_ns = time_ns - self._window_ns
-        while recent[0][0] <= since_ns:
-            self._sum -= recent.popleft()[1]
-            self._full = True
-
-    @property
-    def value(self) -> float | None:
-        """The mean; None until values have come for longer than the window."""
-        return self._sum / len(self._recent) if self._full else None
-
-
 class ForceWatch:
     """The last wrenches, less their bias.
 
@@ -81,7 +47,9 @@ class ForceWatch:
         self._last: tuple[int, float] | None = None  # time and force along z of the newest
         self._times_ns: deque[int] = deque(maxlen=RECENT)
         self._forces_n: deque[float] = deque(maxlen=RECENT)  # along z, at these times
-        self._mean = RunningMean(round(mean_s * 1e9))
+        self._mean_ns = round(mean_s * 1e9)
+        self._averaged: deque[tuple[int, float]] = deque()  # time and force along z
+        self._sum_n, self._full = 0.0, False  # of these; whether they reach back far enough
         self._bias_n: Vector | None = None
         self.force_n: Vector = ZERO
         self.peak_n = 0.0
@@ -96,7 +64,8 @@ class ForceWatch:
         self._bias_n = bias_n
         self._times_ns.clear()
         self._forces_n.clear()
-        self._mean.clear()
+        self._averaged.clear()
+        self._sum_n, self._full = 0.0, False
         self.force_n = ZERO
         self.peak_n = 0.0
 
@@ -139,7 +108,12 @@ class ForceWatch:
             self._forces_n.clear()
         self._times_ns.append(time_ns)
         self._forces_n.append(z)
-        self._mean.add(time_ns, z)
+        averaged, first_ns = self._averaged, time_ns - self._mean_ns
+        averaged.append((time_ns, z))
+        self._sum_n += z
+        while averaged[0][0] <= first_ns:
+            self._sum_n -= averaged.popleft()[1]
+            self._full = True
         return None
 
     def age_s(self, now_ns: int) -> float:
@@ -149,7 +123,7 @@ class ForceWatch:
     @property
     def mean_n(self) -> float | None:
         """Mean force along z over the last `mean_s` [N]; None where less than that is there."""
-        return self._mean.value
+        return self._sum_n / len(self._averaged) if self._full else None
 
     def rate_n_per_s(self) -> float | None:
         """Rise of the force along z over 10 ms [N/s], from means of three; None where too few."""

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tactile_resonance.contact.envelope import WALL_TIME_S, Envelope, ForceWatch, Place, RunningMean
+from tactile_resonance.contact.envelope import WALL_TIME_S, Envelope, ForceWatch, Place
 from tactile_resonance.contact.parameters import (
     ContactParameters,
     Limits,
@@ -298,21 +298,21 @@ def test_forces_from_before_a_long_gap_make_no_rate():
 
 
 @pytest.mark.parametrize("window_ns", [1, 10_000_000, 50_000_000, 400_000_000])
-def test_running_mean_is_that_of_the_values_of_its_time(window_ns):
+def test_mean_is_that_of_the_forces_of_its_time(window_ns):
     rng = np.random.default_rng(2)
     times, values = jittered(rng, 2000, 1_000_000), rng.normal(0.01, 1e-3, 2000)
-    mean = RunningMean(window_ns)
+    watch = ForceWatch(10, window_ns * 1e-9)
     for n in range(2000):
-        mean.add(times[n], values[n])
+        assert watch.add(WrenchSample(times[n], (0.0, 0.0, values[n]), ZERO)) is None
         since = times[n] - window_ns
         if times[0] > since:
-            assert mean.value is None
+            assert watch.mean_n is None
         else:
             inside = np.array(times[: n + 1]) > since
-            assert mean.value == pytest.approx(values[: n + 1][inside].mean(), rel=1e-12)
-    mean.clear()
-    mean.add(0, 1.0)
-    assert mean.value is None
+            assert watch.mean_n == pytest.approx(values[: n + 1][inside].mean(), rel=1e-12)
+    watch.set_bias(ZERO)
+    watch.add(WrenchSample(times[-1] + 1, (0.0, 0.0, 1.0), ZERO))
+    assert watch.mean_n is None
 
 
 def test_mean_of_the_force_is_less_its_bias_and_begins_anew_with_it():
