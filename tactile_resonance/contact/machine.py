@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from tactile_resonance.contact.admission import check_goal
 from tactile_resonance.contact.contact_filter import ContactEstimate
 from tactile_resonance.contact.envelope import Envelope, Place, is_finite
 from tactile_resonance.contact.free_motion import FreeMotion, Withdrawal
@@ -29,7 +28,7 @@ from tactile_resonance.contact.goal import (
 )
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.parameters import ContactParameters, Limits, check_goal
 from tactile_resonance.contact.pressing import Pressing, TissueMotion
 from tactile_resonance.contact.result import (
     Breach,

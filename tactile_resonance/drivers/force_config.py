@@ -16,8 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from tactile_resonance.configuration import shared_file
-from tactile_resonance.contact.admission import require_fit
-from tactile_resonance.contact.cell_checks import CellChecks, CellLimits
+from tactile_resonance.contact.cell_checks import CellChecks, CellLimits, require_fit
 from tactile_resonance.contact.interfaces import (
     ArmError,
     Cell,

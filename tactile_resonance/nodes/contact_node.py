@@ -11,7 +11,7 @@ from rclpy.task import Future
 
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
-from tactile_resonance.contact.admission import require_fit
+from tactile_resonance.contact.cell_checks import require_fit
 from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError, NodeArm
 from tactile_resonance.contact.loop import Cycle
