@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 from tactile_resonance.action import Indent
 from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode
-from tactile_resonance.contact.indentation_record import IndentationRecorder
 from tactile_resonance.contact.interfaces import ForceInfo
+from tactile_resonance.contact.loop import IndentationRecorder
 from tactile_resonance.contact.result import Cause, ContactResult
 from tactile_resonance.fields import check_not_negative
 from tactile_resonance.mechanics.indentation import BallTip, Protocol

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.goal import Aim, HoldMode, State
-from tactile_resonance.contact.indentation_record import IndentationRecorder
+from tactile_resonance.contact.loop import IndentationRecorder
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.mechanics.indentation import BallTip, Protocol
 
