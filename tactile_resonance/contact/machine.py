@@ -217,6 +217,7 @@ class ContactController:
         self._pressing = Pressing(path, observer, speed)
         self._withdrawal = Withdrawal(free, observer)
         self._start_ns, self._longest_s = now_ns, _longest_s(p, limits)
+        self._lowest_m = -p.search_m - limits.depth_m
         self._stays = self._pressed_too_hard = self._rising = False
         self._pressed_n, self._memory.zero, self._usual_m = 0.0, None, self.parameters.standoff_m
         self._enter(State.TRAVEL, now_ns)
@@ -358,15 +359,14 @@ class ContactController:
         if isinstance(fault, ForceError):
             return Breach(Cause.FORCE_SOURCE, str(fault))
         breach = taken or envelope.judge_motion(arm, place) or self._free.judge_way(arm)
-        lowest_m = -observer.parameters.search_m - observer.limits.depth_m
-        if breach is None and state in TOUCHING and place.height_m < lowest_m:
+        if breach is None and state in TOUCHING and place.height_m < self._lowest_m:
             text = (
                 f"{-1e3 * place.height_m:.2f} mm below the expected surface, deeper than search_m"
             )
-            breach = Breach(Cause.DEPTH, f"{text} and depth_m allow, {-1e3 * lowest_m:g} mm")
+            breach = Breach(Cause.DEPTH, f"{text} and depth_m allow, {-1e3 * self._lowest_m:g} mm")
         if breach is None and state in TARED:
             breach = envelope.judge_force(now_ns, observer.watch)
-        elif breach is None and now_ns - self._start_ns > 1e9 * observer.limits.force_age_s:
+        elif breach is None and now_ns - self._start_ns > 1e9 * envelope.limits.force_age_s:
             breach = envelope.judge_force_age(now_ns, observer.watch)
         return breach or self._judge_time(self._since_s(now_ns))
 
