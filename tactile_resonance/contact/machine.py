@@ -206,7 +206,7 @@ class ContactController:
         path = TipPath(goal, self._tip)
         known = self._memory.knows(goal, p.known_radius_m)
         speed = math.inf if known else p.first_speed_m_s(limits.abort_force_n)
-        # it is followed where a moving tip may show it
+        # a zero is followed where a moving tip may show it
         follows = self._under_sample and p.zero_std_n > 0
         zero = self._memory.zero_for(goal) if follows else None
         free = FreeMotion(path, observer, speed, under_sample=self._under_sample, zero=zero)
