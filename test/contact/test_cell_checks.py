@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is called a fault of a force sensor, and what is not."""
+"""Which sources of force are refused; what is called a fault of a force sensor, and what is not."""
 
 import numpy as np
 import pytest

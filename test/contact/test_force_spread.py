@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a force moves by is told from what its sensor makes of it, against closed forms."""
+"""Force and pose over past intervals, and how the force moved, against closed forms and sums of all samples."""
 
 import math
 import threading

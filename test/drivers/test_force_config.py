@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Force sources by configuration: what ships is read, what is wrong is named."""
+"""Force sources by configuration: what ships is read, what is wrong is named; and the force at the tip."""
 
 import sys
 from dataclasses import replace
