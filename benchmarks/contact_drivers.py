@@ -24,14 +24,12 @@ from tactile_resonance.clock import WallClock
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.free_motion import STILL_M_S
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.goal import Aim, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
-from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.drivers.force_config import CanForce, read_force_config
-from tactile_resonance.drivers.force_sources import force_source
+from tactile_resonance.drivers.force_config import CanForce, force_source, read_force_config
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.processes import may_take_priority, take_priority

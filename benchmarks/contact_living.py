@@ -13,8 +13,7 @@ import numpy as np
 
 from benchmarks.contact_case import FORCE_N, KNOWN, MODES, Case, Rig, Setup
 from benchmarks.contact_laws import LIVING_LAWS, steps_of
-from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.goal import Aim, ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits

@@ -30,7 +30,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.drivers.can_frames import read_can_description
 from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.drivers.nidaq_config import NiDaqConfig
+from tactile_resonance.drivers.nidaq import NiDaqConfig
 from tactile_resonance.drivers.twist import TwistConfig
 from tactile_resonance.drivers.ur_config import read_ur_config
 from tactile_resonance.fields import read_file

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_resonance.contact.law import HoldMode
+from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from benchmarks.lock_in_touch import ScatterTouch, lock_in
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.estimator import TouchDetector
+from tactile_resonance.contact.observer import TouchDetector
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.sensor.bench import SimulatedBench

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Force, stiffness and place of the surface from force and height: an extended Kalman filter.
+"""Force, stiffness and place of the surface from force and height: an extended Kalman filter, and its start.
 
 The state is (height of the first touch, its speed, ln C, d ln C / dt) of a ball on soft tissue at the end of
 a spring. Hertz, ``F = C u^(3/2)``, u the depth of the ball; with a beam of stiffness k in series the robot
@@ -14,6 +14,8 @@ Until a motion is detected it stays so low that still tissue is followed as if i
 goes to and fro is pulled back towards its middle: then speed is foreseen where white acceleration would only
 follow it.
 
+It begins with an estimate on a grid from the samples around the touch.
+
 The control loop does this for every force, so it is compiled. numba looks at the date of this file alone:
 whatever is compiled for the filter is in here.
 """
@@ -22,17 +24,120 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numba import float64, from_dtype, njit
 from numba.types import UniTuple
 
-from tactile_resonance.contact.estimator import (
-    RIGID,
-    ContactEstimate,
-    hertz_depth,
-    touch_posterior,
-)
+from tactile_resonance._typing import FloatArray
+
+RIGID = math.inf
+"""Stiffness of the beam where there is none."""
+
+
+def hertz_depth(force_n: float, c: float, beam_n_per_m: float = RIGID) -> float:
+    """Return the depth that the robot must go for a force [m]; 0 for no force."""
+    if force_n <= 0:
+        return 0.0
+    return (force_n / c) ** (2 / 3) + force_n / beam_n_per_m
+
+
+@dataclass(frozen=True)
+class ContactEstimate:
+    """What is known of the contact.
+
+    Attributes
+    ----------
+    force_n, force_std_n : float
+        Force now, and its standard deviation from noise [N].
+    stiffness_n_per_m : float
+        Slope of force over depth, the beam included [N/m].
+    depth_m, depth_std_m : float
+        Past the first touch [m].
+    surface_m : float
+        Height of the tip at first touch, on the scale of the heights given [m].
+    """
+
+    force_n: float
+    force_std_n: float
+    stiffness_n_per_m: float
+    depth_m: float
+    depth_std_m: float
+    surface_m: float
+
+
+LN_C_MEAN, LN_C_STD = math.log(800.0), 1.5
+"""ln of C [N/m^1.5] before the touch: 2 to 40 kPa under balls of 1.5 to 3 mm give 140 to 3800."""
+
+
+SURFACES, STIFFNESSES = 28, 21
+"""Grid of the first estimate, over the height of the touch and ln C."""
+
+RECENT, GROUP = 40, 6
+"""Of the samples before the touch was detected the last are used one by one, the others in groups."""
+
+
+def touch_posterior(
+    heights_m: FloatArray,
+    forces_n: FloatArray,
+    noise_n: float,
+    beam_n_per_m: float = RIGID,
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (2,) and covariance (2, 2) of (height of touch, ln C) from few samples.
+
+    On a grid: the touch anywhere on the way, C by its prior; no linearisation, since at first
+    touch none holds. Older samples, where at most soft tissue was touched, are taken in groups.
+
+    Parameters
+    ----------
+    heights_m, forces_n : (n,) arrays
+        Oldest first; the tip has come down.
+    noise_n : float
+    beam_n_per_m : float
+    """
+    heights, forces, weights = _grouped(heights_m, forces_n)  # (p,) each
+    lowest = float(heights_m.min())
+    span = max(float(heights_m.max()) - lowest, 1e-6)
+    # finer towards the tip, since stiff tissue was touched only just now
+    edges = lowest + span * np.linspace(0, 1, SURFACES + 1) ** 2
+    surface, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)  # (s,)
+    ln_c = LN_C_MEAN + LN_C_STD * np.linspace(-2.5, 2.5, STIFFNESSES)  # (c,)
+    depth = np.maximum(surface[:, None, None] - heights, 0)  # (s, 1, p)
+    c = np.exp(ln_c)[:, None]  # (c, 1)
+    root = np.broadcast_to(np.sqrt(depth), (SURFACES, STIFFNESSES, heights.size)).copy()
+    if beam_n_per_m != RIGID:  # as in `hertz_force`
+        for _ in range(4):
+            excess = (c * root + beam_n_per_m) * root**2 - beam_n_per_m * depth
+            root -= excess / ((3 * c * root + 2 * beam_n_per_m) * root + 1e-12)
+    misfit = ((forces - c * root**3) ** 2) @ weights / noise_n**2  # (s, c)
+    cost = misfit / 2 + ((ln_c - LN_C_MEAN) / LN_C_STD) ** 2 / 2
+    weight = np.exp(-(cost - cost.min())) * width[:, None]
+    weight /= weight.sum()
+    of_surface, of_c = weight.sum(axis=1), weight.sum(axis=0)
+    mean = np.array([of_surface @ surface, of_c @ ln_c])
+    off_s, off_c = surface - mean[0], ln_c - mean[1]
+    mixed = off_s @ weight @ off_c
+    # within a cell all is equally likely
+    variance_s = of_surface @ (off_s**2 + width**2 / 12)
+    variance_c = of_c @ off_c**2 + (ln_c[1] - ln_c[0]) ** 2 / 12
+    return mean, np.array([[variance_s, mixed], [mixed, variance_c]])
+
+
+def _grouped(
+    heights_m: FloatArray, forces_n: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Newest samples as they are, older ones as means of groups; with how many each stands for."""
+    recent = min(len(forces_n), RECENT)
+    older = (len(forces_n) - recent) // GROUP * GROUP
+    begin = len(forces_n) - recent - older
+    parts = [
+        np.concatenate([x[begin : begin + older].reshape(-1, GROUP).mean(axis=1), x[-recent:]])
+        for x in (heights_m, forces_n)
+    ]
+    weights = np.concatenate([np.full(older // GROUP, float(GROUP)), np.ones(recent)])
+    return parts[0], parts[1], weights
+
 
 RATE_MEAN_PER_S, RATE_STD_PER_S = -0.4, 0.5
 """d ln C / dt at first touch: brain and liver lose 0.2 to 1.2 of their stiffness per second."""

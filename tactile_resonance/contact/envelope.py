@@ -1,20 +1,147 @@
 # SPDX-License-Identifier: Apache-2.0
 """The safety envelope: what is measured must keep the limits, and so must what is commanded.
 
-It knows nothing of the law or the state machine: it judges data and bounds velocities, and what it
-says wins. It is software on an ordinary computer, not a certified safety function.
+Every wrench that arrives is judged before it is used: number, overload, stuck, old. The envelope knows nothing
+of the law or the state machine: it judges data and bounds velocities, and what it says wins. It is software on
+an ordinary computer, not a certified safety function.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect
+from collections import deque
 from typing import NamedTuple
 
-from tactile_resonance.contact.force_watch import ForceWatch
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Breach, Cause
-from tactile_resonance.contact.samples import ArmSample
+from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import ZERO, Six, Vector, dot
+
+RATE_WINDOW_NS = 10_000_000
+RECENT, LONGEST_GAP_NS = 64, 200_000_000
+"""So many forces are kept for the rate, none from before a longer gap [ns]."""
+
+
+class ForceWatch:
+    """The last wrenches, less their bias.
+
+    Parameters
+    ----------
+    stuck_samples : int
+        So many equal forces along z in a row are a stuck sensor, or one at the end of its range.
+    mean_s : float
+        Over which the force is averaged [s].
+
+    Attributes
+    ----------
+    force_n : tuple of 3 floats
+        Newest force at the tip, less the bias [N].
+    peak_n : float
+        Largest force along +z since the bias was set [N]; 0 before.
+    """
+
+    def __init__(self, stuck_samples: int, mean_s: float) -> None:
+        self._stuck_samples = stuck_samples
+        self._equal = 1
+        self._last: tuple[int, float] | None = None  # time and force along z of the newest
+        self._times_ns: deque[int] = deque(maxlen=RECENT)
+        self._forces_n: deque[float] = deque(maxlen=RECENT)  # along z, at these times
+        self._mean_ns = round(mean_s * 1e9)
+        self._averaged: deque[tuple[int, float]] = deque()  # time and force along z
+        self._sum_n, self._full = 0.0, False  # of these; whether they reach back far enough
+        self._bias_n: Vector | None = None
+        self.force_n: Vector = ZERO
+        self.peak_n = 0.0
+
+    @property
+    def bias_n(self) -> Vector:
+        """What is taken off [N]; zeros before the tare."""
+        return ZERO if self._bias_n is None else self._bias_n
+
+    def set_bias(self, bias_n: Vector) -> None:
+        """Take what the sensor shows out of contact as 0; forget what came before."""
+        self._bias_n = bias_n
+        self._times_ns.clear()
+        self._forces_n.clear()
+        self._averaged.clear()
+        self._sum_n, self._full = 0.0, False
+        self.force_n = ZERO
+        self.peak_n = 0.0
+
+    def add(self, sample: WrenchSample, inertia_n: float = 0.0) -> Breach | None:
+        """Take one wrench, oldest first; what is wrong with it is returned and it is not used.
+
+        Parameters
+        ----------
+        sample : WrenchSample
+        inertia_n : float
+            Part of the force along z that is not of the contact [N].
+        """
+        time_ns, (x, y, z), _, overload = sample
+        if overload:
+            return Breach(Cause.FORCE_OVERLOAD, "the force sensor reports overload")
+        if not math.isfinite(x + y + z):
+            return Breach(Cause.FORCE_INVALID, f"force is not finite: {x}, {y}, {z} N")
+        since_ns = 0
+        if self._last is not None:
+            last_ns, last_n = self._last
+            since_ns = time_ns - last_ns
+            if since_ns <= 0:
+                text = f"time of forces does not ascend: {time_ns} after {last_ns} ns"
+                return Breach(Cause.FORCE_INVALID, text)
+            self._equal = self._equal + 1 if z == last_n else 1
+            if self._equal >= self._stuck_samples:
+                self._last = time_ns, z
+                text = f"{self._equal} equal forces in a row: the sensor is stuck"
+                return Breach(Cause.FORCE_STUCK, text)
+        self._last = time_ns, z
+        z -= inertia_n
+        if self._bias_n is not None:
+            bias_x, bias_y, bias_z = self._bias_n
+            x, y, z = x - bias_x, y - bias_y, z - bias_z
+            if z > self.peak_n:
+                self.peak_n = z
+        self.force_n = (x, y, z)
+        if since_ns > LONGEST_GAP_NS:
+            self._times_ns.clear()
+            self._forces_n.clear()
+        self._times_ns.append(time_ns)
+        self._forces_n.append(z)
+        averaged, first_ns = self._averaged, time_ns - self._mean_ns
+        averaged.append((time_ns, z))
+        self._sum_n += z
+        while averaged[0][0] <= first_ns:
+            self._sum_n -= averaged.popleft()[1]
+            self._full = True
+        return None
+
+    def age_s(self, now_ns: int) -> float:
+        """Age of the newest wrench [s]; infinite before the first."""
+        return math.inf if self._last is None else (now_ns - self._last[0]) * 1e-9
+
+    @property
+    def mean_n(self) -> float | None:
+        """Mean force along z over the last `mean_s` [N]; None where less than that is there."""
+        return self._sum_n / len(self._averaged) if self._full else None
+
+    def rate_n_per_s(self) -> float | None:
+        """Rise of the force along z over 10 ms [N/s], from means of three; None where too few."""
+        times, forces = self._times_ns, self._forces_n
+        if len(times) < 6:
+            return None
+        newest_ns = (times[-1] + times[-2] + times[-3]) / 3
+        then = newest_ns - RATE_WINDOW_NS
+        # the three samples nearest to 10 ms before, none of the newest: `first` is the oldest of them
+        first = min(bisect(times, then), len(times) - 6)
+        while first > 0 and abs(times[first - 1] - then) <= abs(times[first + 2] - then):
+            first -= 1
+        span = newest_ns - (times[first] + times[first + 1] + times[first + 2]) / 3
+        if span < RATE_WINDOW_NS / 2:
+            return None
+        before = forces[first] + forces[first + 1] + forces[first + 2]
+        return (forces[-1] + forces[-2] + forces[-3] - before) / 3 / (span * 1e-9)
+
 
 WALL_TIME_S = 0.1
 """Towards a wall of the workspace the tip goes no faster than this brings it there [s]."""

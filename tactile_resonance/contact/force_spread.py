@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much the force of a contact moved while it was measured, beside the noise of its sensor.
+"""What the force and the pose of the tip were over a past interval, and how much the force moved meanwhile.
+
+Every wrench and every pose of the last seconds is kept. Between two wrenches the force is taken to run
+linearly, so that each wrench counts for the time that it stands for, and an interval may begin and end
+anywhere between two of them. An interval is summed when it is asked for, over its own wrenches alone and
+relative to the first of them: no cumulative sum of earlier forces is there to cancel.
 
 Tissue moves with breath and heartbeat, at up to a few hertz; a force sensor makes noise up to its own rate.
 They are distinguished by time scale: what means over 10 ms differ by from one to the next is noise (mean square
@@ -10,11 +15,21 @@ their share of it is the force.
 from __future__ import annotations
 
 import math
+import threading
+from bisect import bisect_left, bisect_right
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tactile_resonance._typing import FloatArray, IntArray
+from tactile_resonance.contact.samples import ArmSample, WrenchSample
+from tactile_resonance.contact.vectors import Vector, vector
+from tactile_resonance.fields import require
 
 SHORT_S = 0.02
 """Of the short means [s]."""
@@ -108,3 +123,248 @@ def joined_spread(blocks: Sequence[tuple[float, ForceSpread, float]]) -> ForceSp
         min(spread.min_n for _, spread, _ in known),
         max(spread.max_n for _, spread, _ in known),
     )
+
+
+GAP_PERIODS = 3
+"""Wrenches further apart than so many of their nominal periods say nothing of the time between them."""
+
+POSE_GAP_NS = 100_000_000
+"""The same of poses [ns]: a loop that has nothing to do looks seldom, and the tip moves slowly."""
+
+LEAST_COVERAGE = 0.8
+"""Of an interval that forces must cover for their mean to be its force."""
+
+BATCHES, LEAST_WRENCHES = 8, 32
+"""For the standard deviation of the mean."""
+
+SPARE = 1.1
+"""A source may be faster than it states by this factor without losing the oldest wrenches."""
+
+
+@dataclass(frozen=True)
+class ForceOver:
+    """Force and pose over an interval; NaN where not known.
+
+    Attributes
+    ----------
+    force_n : float
+        Time-weighted mean of the force along the normal [N].
+    force_std_n : float
+        Standard deviation of that mean [N]: that of the zero, and from the means of eight batches, so that
+        correlated noise and a slow decay count as they should (method of batch means; Law, *Simulation
+        Modeling and Analysis*, section 9.5.3). NaN for fewer than 32 wrenches.
+    spread : ForceSpread
+        How the force moved meanwhile.
+    coverage : float
+        Share of the interval over which valid wrenches came without a gap.
+    position_m : tuple of 3 floats
+        Mean place of the tip in the base [m].
+    rotation_rad : tuple of 3 floats
+        Its rotation vector nearest to the middle of the interval [rad].
+    reason : str
+        Why `force_n` is NaN; empty where it is not.
+    """
+
+    force_n: float
+    force_std_n: float
+    spread: ForceSpread
+    coverage: float
+    position_m: Vector
+    rotation_rad: Vector
+    reason: str
+
+
+class ForceRecord:
+    """Forces and poses of the last seconds; one thread may add while another asks.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Nominal rate of the wrenches.
+    period_s : float
+        Of the control loop [s].
+    length_s : float
+        How far back it reaches [s].
+    """
+
+    def __init__(self, rate_hz: float, period_s: float, length_s: float = 30.0) -> None:
+        for name, value in (("rate_hz", rate_hz), ("period_s", period_s), ("length_s", length_s)):
+            require(0 < value < math.inf, name, value, "a number above 0")
+        self._length_ns = round(1e9 * length_s)
+        # rows of a time [ns] and a force, or the six numbers of a pose: tuples of plain numbers, which Python's
+        # collection of garbage does not look at
+        self._forces, self._poses = (
+            deque[tuple[float, ...]](maxlen=math.ceil(SPARE * most) + 1)
+            for most in (rate_hz * length_s, length_s / period_s)
+        )
+        self._force_gap_ns = GAP_PERIODS * 1e9 / rate_hz
+        self._now_ns, self._zero_std_n = 0, 0.0
+        self._lock = threading.Lock()
+
+    def restart(self, zero_std_n: float = 0.0) -> None:
+        """Forget all forces, as of a new tare: earlier ones are not less its zero.
+
+        Parameters
+        ----------
+        zero_std_n : float
+            Standard deviation of the new zero along the normal [N].
+        """
+        with self._lock:
+            self._forces.clear()
+            self._zero_std_n = zero_std_n
+
+    def add(
+        self,
+        time_ns: int,
+        wrenches: Sequence[WrenchSample],
+        bias_n: Vector,
+        arm: ArmSample | None,
+        *,
+        valid: bool,
+    ) -> None:
+        """Take what came in one period of the control loop.
+
+        Parameters
+        ----------
+        time_ns : int
+            Of the period [ns].
+        wrenches : sequence of WrenchSample
+            Oldest first, at the tip.
+        bias_n : tuple of 3 floats
+            Force of the tare, taken off here [N].
+        arm : ArmSample or None
+        valid : bool
+            Whether these wrenches are forces of a contact: after a tare and without a fault. Others
+            count as not heard.
+        """
+        zero_n, forces, poses = bias_n[2], self._forces, self._poses
+        with self._lock:
+            self._now_ns = time_ns
+            # a source may repeat its newest wrench: each counts once
+            newest_ns = forces[-1][0] if forces else -math.inf
+            for heard_ns, force_n, _, overload in wrenches:
+                if heard_ns > newest_ns:
+                    newest_ns = heard_ns
+                    good = valid and not overload
+                    forces.append((heard_ns, force_n[2] - zero_n if good else math.nan))
+            if arm is not None and (not poses or arm.time_ns > poses[-1][0]):
+                poses.append((arm.time_ns, *arm.position_m, *arm.rotation_rad))
+
+    def over(self, t0_ns: int, t1_ns: int) -> ForceOver:
+        """Return what is known of the interval from `t0_ns` to `t1_ns`.
+
+        Raises
+        ------
+        ValueError
+            If it does not end after it begins.
+        """
+        require(t0_ns < t1_ns, "t1_ns", t1_ns, f"above t0_ns = {t0_ns}")
+        with self._lock:
+            now_ns, zero_std_n = self._now_ns, self._zero_std_n
+            full = len(self._forces) == self._forces.maxlen
+            oldest_ns = self._forces[0][0] if full else -math.inf
+            heard, placed = (_cut(rows, t0_ns, t1_ns) for rows in (self._forces, self._poses))
+        (times, rows), (pose_times, poses) = _columns(heard, 1), _columns(placed, 6)
+        spans = _Spans(times, rows, t0_ns, t1_ns, self._force_gap_ns)
+        places = _Spans(pose_times, poses[:, :3], t0_ns, t1_ns, POSE_GAP_NS)
+        position_m = rotation_rad = (math.nan, math.nan, math.nan)
+        if places.coverage >= LEAST_COVERAGE:
+            position_m = vector(places.mean())
+            rotation_rad = vector(poses[np.abs(pose_times - (t0_ns + t1_ns) // 2).argmin(), 3:])
+        reason = self._missing(t0_ns, t1_ns, now_ns, oldest_ns, spans.coverage)
+        if reason:
+            nan = math.nan
+            return ForceOver(
+                nan, nan, ForceSpread(), spans.coverage, position_m, rotation_rad, reason
+            )
+        inside = (times >= t0_ns) & (times <= t1_ns)
+        std_n, spread = math.nan, ForceSpread()
+        if np.count_nonzero(inside & np.isfinite(rows[:, 0])) >= LEAST_WRENCHES:
+            std_n = math.hypot(spans.std_of_mean(), zero_std_n)
+            time_s = (times[inside] - t0_ns) * 1e-9
+            spread = spread_of(time_s, rows[inside, 0], (t1_ns - t0_ns) * 1e-9)
+        force_n = float(spans.mean()[0])
+        return ForceOver(force_n, std_n, spread, spans.coverage, position_m, rotation_rad, "")
+
+    def _missing(
+        self, t0_ns: int, t1_ns: int, now_ns: int, oldest_ns: float, coverage: float
+    ) -> str:
+        """Why the force of an interval is not known; empty where it is."""
+        if t1_ns > now_ns:
+            return f"the block ends {(t1_ns - now_ns) * 1e-6:.1f} ms in the future"
+        if t0_ns < max(now_ns - self._length_ns, oldest_ns):
+            ago_s, length_s = (now_ns - t0_ns) * 1e-9, self._length_ns * 1e-9
+            return f"the block begins {ago_s:.1f} s ago, forces are kept for {length_s:g} s"
+        if coverage < LEAST_COVERAGE:
+            accepted = f"at least {100 * LEAST_COVERAGE:g} % are accepted"
+            return f"forces cover {100 * coverage:.3g} % of the block, {accepted}"
+        return ""
+
+
+class _Spans:
+    """The spans between successive samples that are not too far apart, within an interval.
+
+    Parameters
+    ----------
+    times_ns : (n,) array
+        Ascending.
+    values : (n, k) array
+        NaN in the first column where there is none.
+    t0_ns, t1_ns : int
+    longest_ns : float
+        A longer span says nothing.
+
+    Attributes
+    ----------
+    coverage : float
+        Share of the interval that they cover.
+    """
+
+    def __init__(
+        self, times_ns: IntArray, values: FloatArray, t0_ns: int, t1_ns: int, longest_ns: float
+    ) -> None:
+        # from the beginning of the interval: as floats, times of the clock would lose their last digits
+        t, end = (times_ns - t0_ns).astype(float), float(t1_ns - t0_ns)
+        corners, steps = np.clip(t, 0.0, end), np.diff(t)
+        values = values.copy()
+        if len(steps):  # at the ends of the interval the value is that between two samples
+            first = (corners[0] - t[0]) / steps[0] * (values[1] - values[0])
+            last = (corners[-1] - t[-1]) / steps[-1] * (values[-1] - values[-2])
+            values[0] += first
+            values[-1] += last
+        known = np.isfinite(values[:, 0])
+        self._reference = (
+            values[known.argmax()].copy() if known.any() else np.zeros(values.shape[1])
+        )
+        values -= self._reference
+        lengths, middles = np.diff(corners), (values[:-1] + values[1:]) / 2  # (n - 1,), (n - 1, k)
+        unknown = ~(known[:-1] & known[1:] & (steps <= longest_ns))
+        lengths[unknown], middles[unknown] = 0.0, 0.0
+        # up to the end of each span: time that is covered, and integral of the values over it
+        self._covered_ns = np.concatenate([[0.0], np.cumsum(lengths)])  # (n,)
+        sums = np.cumsum(lengths[:, None] * middles, axis=0)
+        self._sums = np.concatenate([np.zeros((1, values.shape[1])), sums])  # (n, k)
+        self.coverage = float(self._covered_ns[-1] / end)
+
+    def mean(self) -> FloatArray:
+        """Time-weighted mean (k,)."""
+        return self._reference + self._sums[-1] / self._covered_ns[-1]
+
+    def std_of_mean(self) -> float:
+        """Standard deviation of the first column's mean, from batches of equal covered time."""
+        covered, sums = self._covered_ns, self._sums[:, 0]
+        ends = np.linspace(0.0, covered[-1], BATCHES + 1)
+        means = np.diff(np.interp(ends, covered, sums)) / (covered[-1] / BATCHES)
+        return float(means.std(ddof=1) / math.sqrt(BATCHES))
+
+
+def _cut(rows: deque[tuple[float, ...]], t0_ns: int, t1_ns: int) -> list[tuple[float, ...]]:
+    """Rows of an interval, and one more on either side; quick, for the control loop waits meanwhile."""
+    first = max(0, bisect_right(rows, t0_ns, key=itemgetter(0)) - 1)
+    return list(islice(rows, first, bisect_left(rows, t1_ns, key=itemgetter(0)) + 1))
+
+
+def _columns(rows: list[tuple[float, ...]], width: int) -> tuple[IntArray, FloatArray]:
+    """Times (n,) and values (n, width)."""
+    values = np.array([row[1:] for row in rows], float).reshape(len(rows), width)
+    return np.array([row[0] for row in rows], np.int64), values

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Six
+from tactile_resonance.fields import require
 
 
 class State(str, Enum):
@@ -36,6 +36,24 @@ TARED = (State.APPROACH, *TOUCHING)
 
 ENDED = (State.RETRACT, State.FAULT)
 """States in which forces do not count any more."""
+
+
+class HoldMode(str, Enum):
+    """What is kept once the force is reached."""
+
+    FORCE = "force"
+    INDENTATION = "indentation"
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What is asked of a contact: force [N] and what is held then."""
+
+    force_n: float
+    hold: HoldMode = HoldMode.FORCE
+
+    def __post_init__(self) -> None:
+        require(1e-3 <= self.force_n < math.inf, "force_n", self.force_n, "1 mN or above")
 
 
 @dataclass(frozen=True)

@@ -8,29 +8,38 @@ Pure: data in, a command out. What talks to devices is in `loop`; what each stat
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
-from tactile_resonance.contact.admission import check_goal
+from tactile_resonance.contact.contact_filter import ContactEstimate
 from tactile_resonance.contact.envelope import Envelope, Place, is_finite
-from tactile_resonance.contact.estimator import ContactEstimate
-from tactile_resonance.contact.free_motion import FreeMotion
-from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.goal import REST, TOUCHING, Command, ContactGoal, Move, State
+from tactile_resonance.contact.free_motion import FreeMotion, Withdrawal
+from tactile_resonance.contact.geometry import TipGeometry, TipPath
+from tactile_resonance.contact.goal import (
+    ENDED,
+    REST,
+    TARED,
+    TOUCHING,
+    Command,
+    ContactGoal,
+    HoldMode,
+    Move,
+    State,
+)
 from tactile_resonance.contact.interfaces import ArmError, ForceError
-from tactile_resonance.contact.judgement import Judgement
-from tactile_resonance.contact.law import HoldMode
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.outcome import Outcome
-from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.parameters import ContactParameters, Limits, check_goal
 from tactile_resonance.contact.pressing import Pressing, TissueMotion
-from tactile_resonance.contact.result import Breach, Cause, ContactResult, NotIdleError
+from tactile_resonance.contact.result import (
+    Breach,
+    Cause,
+    ContactResult,
+    Memory,
+    NotIdleError,
+    Outcome,
+)
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.contact.tare import Zero
-from tactile_resonance.contact.tip_path import TipPath
-from tactile_resonance.contact.vectors import Vector, dot, vector
-from tactile_resonance.contact.withdrawal import Withdrawal
+from tactile_resonance.contact.vectors import Vector, dot
 
 RELIEVING = (*TOUCHING, State.RETRACT)
 """States in which force is taken off as fast as it may be."""
@@ -49,13 +58,6 @@ STAYING_CAUSES = ARM_CAUSES | {Cause.HELD}
 
 LINGER_NS = 1_000_000_000
 """So long a tip waits at a goal's own standoff for the next goal before it rises to the usual one [ns]."""
-
-SUCCEEDED, KNOWN_SHARE = 10_000, 1.25
-"""Places of successful contacts that are kept, at most. Near one the tissue counts as known for forces up to
-its own times the second."""
-
-SAME_RAD = 1e-4
-"""Goals turned by less against each other are turned alike: the weight of a dish turns with the tip."""
 
 IDLE_PERIODS = 10
 """While no contact is under way one of so many periods is run, where nothing else is stated: 20 ms, half of
@@ -115,10 +117,7 @@ class ContactController:
         self._envelope = Envelope(limits)
         self._observer = Observer(parameters, limits)
         self._outcome = Outcome(self._observer, 0)
-        # where contacts were, and with how much force
-        self._succeeded: deque[tuple[Vector, float]] = deque(maxlen=SUCCEEDED)
-        # zero of the contact before, where it stayed, and how the tip was turned
-        self._zero: tuple[Zero, Vector] | None = None
+        self._memory = Memory()
         self._pressed_n = 0.0
         self._height_m = 0.0
         self._state_ns = 0
@@ -183,7 +182,7 @@ class ContactController:
             raise NotIdleError(f"parameters: refused in state {self.state.value}; accepted in idle")
         limits.check(parameters)
         if parameters.beam_stiffness_n_per_m != self.parameters.beam_stiffness_n_per_m:
-            self._succeeded.clear()  # what was safe with one tip need not be with another
+            self._memory.clear()  # what was safe with one tip need not be with another
         self.parameters, self.limits = parameters, limits
         self._envelope = Envelope(limits)
 
@@ -205,8 +204,11 @@ class ContactController:
         check_goal(goal, p, limits, self._tip)
         observer = Observer(p, limits)
         path = TipPath(goal, self._tip)
-        speed = math.inf if self._is_known(goal) else p.first_speed_m_s(limits.abort_force_n)
-        zero = self._zero_for(goal)
+        known = self._memory.knows(goal, p.known_radius_m)
+        speed = math.inf if known else p.first_speed_m_s(limits.abort_force_n)
+        # a zero is followed where a moving tip may show it
+        follows = self._under_sample and p.zero_std_n > 0
+        zero = self._memory.zero_for(goal) if follows else None
         free = FreeMotion(path, observer, speed, under_sample=self._under_sample, zero=zero)
         if arm is not None and is_finite(arm):
             free.begin(arm)
@@ -214,9 +216,10 @@ class ContactController:
         self._outcome = Outcome(observer, now_ns)
         self._pressing = Pressing(path, observer, speed)
         self._withdrawal = Withdrawal(free, observer)
-        self._judgement = Judgement(self._envelope, observer, free, now_ns)
+        self._start_ns, self._longest_s = now_ns, _longest_s(p, limits)
+        self._lowest_m = -p.search_m - limits.depth_m
         self._stays = self._pressed_too_hard = self._rising = False
-        self._pressed_n, self._zero, self._usual_m = 0.0, None, self.parameters.standoff_m
+        self._pressed_n, self._memory.zero, self._usual_m = 0.0, None, self.parameters.standoff_m
         self._enter(State.TRAVEL, now_ns)
 
     def retract(self) -> None:
@@ -263,15 +266,12 @@ class ContactController:
             return None
         self._stride = 1
         place = None
-        if arm is not None and is_finite(
-            arm
-        ):  # of one whose place is not finite nothing else is known
+        # of an arm whose place is not finite nothing else is known
+        if arm is not None and is_finite(arm):
             if self.state is State.TRAVEL and not self._free.begun:
                 self._begin_way(now_ns, arm)
             place = self._place(goal, arm)
-        breach = self._judgement.breach(
-            self.state, self._since_s(now_ns), now_ns, arm, place, wrenches, fault
-        )
+        breach = self._breach(now_ns, arm, place, wrenches, fault)
         if breach is not None and self.state is State.FAULT:
             self._stays = True  # nothing else counts in this state
         elif breach is not None:
@@ -338,6 +338,46 @@ class ContactController:
         except ValueError as error:
             self._fail(Breach(Cause.HOUSING, str(error)), now_ns)
 
+    def _breach(
+        self,
+        now_ns: int,
+        arm: ArmSample | None,
+        place: Place | None,
+        wrenches: Sequence[WrenchSample],
+        fault: ArmError | ForceError | None,
+    ) -> Breach | None:
+        """The first thing that is wrong; in retraction and fault only what concerns the arm."""
+        if isinstance(fault, ArmError):
+            return Breach(Cause.ARM_LINK, str(fault))
+        state, envelope, observer = self.state, self._envelope, self._observer
+        breach = envelope.judge_arm(now_ns, arm)
+        if breach is not None or arm is None or place is None:
+            return breach
+        taken = observer.take(wrenches, arm.time_ns, place.height_m)
+        if state in ENDED:
+            return None
+        if isinstance(fault, ForceError):
+            return Breach(Cause.FORCE_SOURCE, str(fault))
+        breach = taken or envelope.judge_motion(arm, place) or self._free.judge_way(arm)
+        if breach is None and state in TOUCHING and place.height_m < self._lowest_m:
+            text = (
+                f"{-1e3 * place.height_m:.2f} mm below the expected surface, deeper than search_m"
+            )
+            breach = Breach(Cause.DEPTH, f"{text} and depth_m allow, {-1e3 * self._lowest_m:g} mm")
+        if breach is None and state in TARED:
+            breach = envelope.judge_force(now_ns, observer.watch)
+        elif breach is None and now_ns - self._start_ns > 1e9 * envelope.limits.force_age_s:
+            breach = envelope.judge_force_age(now_ns, observer.watch)
+        return breach or self._judge_time(self._since_s(now_ns))
+
+    def _judge_time(self, since_s: float) -> Breach | None:
+        most_s = self._longest_s[self.state]
+        if since_s <= most_s:
+            return None
+        if self.state is State.HOLD:
+            return Breach(Cause.HOLD_ENDED, f"held for {most_s:g} s, as long as is allowed")
+        return Breach(Cause.TIME, f"{self.state.value} took longer than {most_s:g} s")
+
     def _heed_wish(self, now_ns: int, breach: Breach | None) -> None:
         """Draw back as asked for; a wish that the arm cannot follow soon is forgotten."""
         if self.state is State.RETRACT:
@@ -385,43 +425,9 @@ class ContactController:
                 self._outcome.reached(now_ns, self._pressing.touched_ns, estimate, told_m)
             if move.to is State.IDLE and not self._rising:
                 self._outcome.drawn_back(self._withdrawal.zero_n)
-                self._remember(goal)
+                self._memory.keep(goal, self.result, self._observer.zero)
             self._enter(move.to, now_ns)
             self._rising = self._rising and move.to is not State.IDLE
-
-    def _zero_for(self, goal: ContactGoal) -> Zero | None:
-        """The zero as the contact before left it, where a moving tip may show it and it is turned alike."""
-        if self._zero is None or not self._under_sample or self.parameters.zero_std_n == 0.0:
-            return None
-        zero, rotation_rad = self._zero
-        return zero if math.dist(rotation_rad, goal.touch.rotation_rad) < SAME_RAD else None
-
-    def _is_known(self, goal: ContactGoal) -> bool:
-        """Whether a contact near a goal has succeeded."""
-        most_n = goal.aim.force_n / KNOWN_SHARE
-        return any(force_n >= most_n for _, force_n in self._near(goal))
-
-    def _near(self, goal: ContactGoal) -> list[tuple[Vector, float]]:
-        """Contacts near a goal that have succeeded."""
-        place_m, radius_m = vector(goal.touch.position_m), self.parameters.known_radius_m
-        return [entry for entry in self._succeeded if math.dist(place_m, entry[0]) <= radius_m]
-
-    def _remember(self, goal: ContactGoal) -> None:
-        """Keep where a contact was that ended as it should."""
-        result = self.result
-        if (
-            result is not None
-            and result.reached
-            and result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED)
-        ):
-            self._succeeded.append((vector(goal.touch.position_m), goal.aim.force_n))
-            if result.zero_change_n == 0.0 and self._observer.zero is not None:
-                self._zero = self._observer.zero, vector(goal.touch.rotation_rad)
-
-    def _forget(self, goal: ContactGoal) -> None:
-        """Near a contact that pressed too hard nothing is known, whatever becomes of it."""
-        for entry in self._near(goal):
-            self._succeeded.remove(entry)
 
     # pieces
 
@@ -455,7 +461,7 @@ class ContactController:
         self._stays, self._rising = breach.cause in STAYING_CAUSES, False
         self._pressed_too_hard = breach.cause in PRESSING_CAUSES
         if self._pressed_too_hard and self.goal is not None:
-            self._forget(self.goal)
+            self._memory.forget(self.goal, self.parameters.known_radius_m)
         self._end(breach, now_ns)
         self._enter(State.FAULT, now_ns)
 
@@ -465,3 +471,15 @@ class ContactController:
         if holding and self.motion:
             breach = replace(breach, message=f"{breach.message}; {self.motion}")
         self._outcome.ended(breach, now_ns, self._free.told_m, holding)
+
+
+def _longest_s(parameters: ContactParameters, limits: Limits) -> dict[State, float]:
+    """How long each state may last before the tip is drawn back [s]."""
+    return {
+        State.TRAVEL: limits.travel_s,
+        State.TARE: 2 * parameters.tare_s + 2.0,
+        State.APPROACH: limits.approach_s,
+        State.CONTACT: limits.press_s,
+        State.SETTLE: limits.press_s,
+        State.HOLD: limits.hold_s,
+    }

@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a contact is made, and within which limits: read from ``config/contact.yaml``, checked."""
+"""How a contact is made, within which limits, and what may be asked; read from ``config/contact.yaml``."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.goal import ContactGoal
+from tactile_resonance.contact.vectors import rotated
 from tactile_resonance.fields import build, check_within, read_file, require
+
+if TYPE_CHECKING:  # it needs the limits
+    from tactile_resonance.contact.geometry import TipGeometry
 
 
 def within(default: float, low: float, high: float, description: str) -> Any:
@@ -295,6 +302,62 @@ class Limits:
         least = way_m / speed
         need = f"{least:.3g} s or more for {1e3 * way_m:g} mm at {speed:.3g} m/s"
         require(self.approach_s >= least, "approach_s", self.approach_s, need)
+
+
+FORCE_SHARE = 2 / 3
+"""Of the abort force that may be asked for."""
+
+
+def check_goal(
+    goal: ContactGoal,
+    parameters: ContactParameters,
+    limits: Limits,
+    tip: TipGeometry | None = None,
+) -> None:
+    """Raise ``ValueError`` where a goal lies beyond the limits.
+
+    Parameters
+    ----------
+    goal : ContactGoal
+    parameters : ContactParameters
+    limits : Limits
+    tip : TipGeometry, optional
+        Its housing must stay clear of the surface as deep as the limits allow, the tip as far off its
+        orientation as they allow.
+    """
+    good = bool(np.isfinite(goal.touch.vector).all())
+    require(good, "touch", goal.touch.vector.tolist(), "six finite numbers")
+    most = FORCE_SHARE * limits.abort_force_n
+    good = goal.aim.force_n <= most * (1 + 1e-9)  # two thirds are no round number
+    require(good, "force_n", goal.aim.force_n, f"up to {most:g}, two thirds of abort_force_n")
+    if math.isfinite(goal.hold_s):
+        slow, fastest = goal.unload_speed_m_s, parameters.retract_speed_m_s
+        unload_s = limits.depth_m / slow if slow > 0 else 0.0
+        most = limits.hold_s - unload_s
+        accepted = f"up to {most:g}, limits.hold_s less {unload_s:g} s to draw back"
+        require(0 <= goal.hold_s <= most, "hold_s", goal.hold_s, accepted)
+        accepted = f"up to {fastest:g}, retract_speed_m_s"
+        require(0 <= slow <= fastest, "unload_speed_m_s", slow, accepted)
+    box, normal = limits.workspace, np.array(rotated(goal.touch.turn, (0.0, 0.0, 1.0)))
+    for name, height in (
+        ("standoff", parameters.standoff_m),
+        ("deepest place", -parameters.search_m - limits.depth_m),
+    ):
+        place = goal.touch.position_m + height * normal
+        if (place < box.low_m).any() or (place > box.high_m).any():
+            ends = f"{box.low_m} to {box.high_m}"
+            raise ValueError(f"touch: its {name} {place} lies outside the workspace {ends}")
+    if normal[2] < math.cos(limits.tilt_rad):
+        raise ValueError(f"touch: tilted by more than tilt_rad = {limits.tilt_rad}")
+    if tip is not None:
+        height = tip.worst_height(limits.depth_m, limits.misalignment_rad)
+        if height < limits.clearance_m:
+            raise ValueError(
+                f"depth_m: at {1e3 * limits.depth_m:g} mm, the tip off by misalignment_rad = "
+                f"{limits.misalignment_rad:g}, the housing is {1e3 * height:.2f} mm above the surface; "
+                f"accepted is clearance_m = {1e3 * limits.clearance_m:g} mm or more: less depth, or a "
+                "larger beam_tilt_rad"
+            )
 
 
 @dataclass(frozen=True)

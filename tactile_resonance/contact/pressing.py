@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states in contact: contact found, settle, hold; and a touch that turns out to have been noise.
+"""The states in contact, contact found, settle, hold, with the control law; and a touch that was noise.
+
+The law: how fast the tip goes, from what is known of the contact. The estimated model says at which height the
+force asked for is reached; the rest of the way, less what the arm will still do of earlier commands, is gone in
+a time constant. So the tip slows down early on stiff tissue and late on soft, and the dead time does not make
+it oscillate. While the stiffness is uncertain the aim stays below the force by that uncertainty. The speed of
+tissue that moves is added to its own.
 
 While the tip holds a force on tissue that moves, its own way says how far and how often.
 """
@@ -12,15 +18,64 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.contact_filter import ContactFilter
+from tactile_resonance.contact.contact_filter import ContactFilter, hertz_depth
 from tactile_resonance.contact.envelope import Place
-from tactile_resonance.contact.goal import Move, State, failed
-from tactile_resonance.contact.law import SURE_SHARE, HoldMode, force_speed, place_speed
+from tactile_resonance.contact.geometry import TipPath
+from tactile_resonance.contact.goal import HoldMode, Move, State, failed
 from tactile_resonance.contact.observer import Observer
-from tactile_resonance.contact.parameters import REACTION_S
+from tactile_resonance.contact.parameters import REACTION_S, ContactParameters
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
-from tactile_resonance.contact.tip_path import TipPath
+
+SURE_SHARE = 0.02
+"""Uncertainty of the force, as a share of it, for which no caution is needed."""
+
+
+def force_speed(
+    model: ContactFilter,
+    height_m: float,
+    pending_m: float,
+    aim_n: float,
+    parameters: ContactParameters,
+    *,
+    holding: bool,
+) -> float:
+    """Return the speed along the normal, away from the surface positive [m/s], towards a force.
+
+    Parameters
+    ----------
+    model : ContactFilter
+    height_m : float
+        Of the tip now.
+    pending_m : float
+        Way that the arm will still go of earlier commands [m].
+    aim_n : float
+    parameters : ContactParameters
+    holding : bool
+        Whether the force has been reached: then without caution, and slower where the tissue is still.
+    """
+    depth = model.depth_for(aim_n)
+    target = model.surface_m - depth
+    if holding:
+        time = parameters.time_constant_s if model.moving else parameters.hold_time_constant_s
+    else:
+        time = parameters.time_constant_s
+        slope, std = model.slope_at(depth)
+        target += parameters.caution * max(0.0, std - SURE_SHARE * aim_n) / slope
+    # relaxation takes the force away: at constant force u goes as C^(-2/3)
+    creep = 2 / 3 * model.c_rate_per_s * hertz_depth(aim_n, model.c)
+    follow = creep + model.surface_speed_m_s
+    # what is under way will be gone by then, and the target will have moved on
+    target += follow * (parameters.arm_dead_time_s + parameters.arm_lag_s)
+    return (target - height_m - pending_m) / time + follow
+
+
+def place_speed(
+    target_m: float, height_m: float, pending_m: float, parameters: ContactParameters
+) -> float:
+    """Return the speed along the normal that keeps a height [m/s]."""
+    return (target_m - height_m - pending_m) / parameters.hold_time_constant_s
+
 
 EVERY_NS, NEWEST = 20_000_000, 1000
 """Of the tip's heights one is kept in so long [ns]; so many, the newest."""

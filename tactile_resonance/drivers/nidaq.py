@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NI hardware through nidaqmx: one output and two inputs on one sample clock.
+"""NI hardware through nidaqmx: one output and two inputs on one sample clock, and their configuration.
 
 Written after the interface of nidaqmx-python 1.x and tested against a stand-in of it. It has not
 been run on hardware: go through docs/first_connection.md before a sensor is connected.
@@ -8,14 +8,18 @@ been run on hardware: go through docs/first_connection.md before a sensor is con
 from __future__ import annotations
 
 import importlib
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import polynomial
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.drivers.acquisition import (
@@ -24,11 +28,155 @@ from tactile_resonance.drivers.acquisition import (
     DeviceError,
     DeviceInfo,
 )
-from tactile_resonance.drivers.nidaq_config import TERMINALS, InputChannel, NiDaqConfig
-from tactile_resonance.drivers.nidaq_scale import CountScale
-from tactile_resonance.fields import one_line
+from tactile_resonance.fields import (
+    check_above_zero,
+    known_keys,
+    number,
+    one_line,
+    read,
+    read_dataclass,
+    require,
+)
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.record import Channel, InputKind
+from tactile_resonance.record import BetweenSamples, Channel, InputKind
+
+TERMINALS = {
+    "differential": "DIFF",
+    "rse": "RSE",
+    "nrse": "NRSE",
+    "pseudo_differential": "PSEUDO_DIFF",
+    "default": "DEFAULT",
+}
+"""Our names, and those of ``nidaqmx.constants.TerminalConfiguration``."""
+
+
+@dataclass(frozen=True)
+class InputChannel:
+    """One analogue input: its name, half its range [V], and a key of `TERMINALS`."""
+
+    channel: str
+    range_v: float
+    terminals: str
+
+    def __post_init__(self) -> None:
+        require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ai0")
+        check_above_zero(self, "range_v")
+        good = self.terminals in TERMINALS
+        require(good, "terminals", self.terminals, f"one of {', '.join(TERMINALS)}")
+
+
+@dataclass(frozen=True)
+class OutputChannel:
+    """The analogue output: its name, and the largest voltage of either sign that may be put out."""
+
+    channel: str
+    max_voltage_v: float
+
+    def __post_init__(self) -> None:
+        require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ao0")
+        check_above_zero(self, "max_voltage_v")
+
+
+def _read_actuator(value: Any, field: str) -> InputChannel | None:
+    """None where the drive is taken to be what was asked of the output."""
+    source = value.get("source") if isinstance(value, dict) else None
+    measured = read(InputKind, source, f"{field}.source") is InputKind.MEASURED
+    channel = {key: item for key, item in value.items() if key != "source"}
+    if not measured:
+        known_keys(channel, {"source"}, field)
+    return read_dataclass(InputChannel, channel, field) if measured else None
+
+
+def _read_delay(value: object, field: str) -> float:
+    return math.nan if value is None else number(value, field)
+
+
+@dataclass(frozen=True)
+class NiDaqConfig:
+    """What `NiDaqDevice` needs to know; see ``config/devices/nidaqmx.yaml``.
+
+    Attributes
+    ----------
+    output : OutputChannel
+    actuator : InputChannel or None
+        None where the drive is not measured.
+    sensor : InputChannel
+    between_samples : BetweenSamples
+    buffer_s : float
+        Length of the input buffer [s].
+    anti_alias_filter : str
+    channel_delay_s : float
+        Of the sensor channel behind the actuator channel; NaN where not measured.
+    clock_device : str
+        Whose sample clock and start trigger all use; empty: that of the sensor.
+    """
+
+    output: OutputChannel
+    actuator: Annotated[InputChannel | None, _read_actuator]
+    sensor: InputChannel
+    between_samples: BetweenSamples
+    buffer_s: float
+    anti_alias_filter: str = ""
+    channel_delay_s: Annotated[float, _read_delay] = math.nan
+    clock_device: str = ""
+
+    def __post_init__(self) -> None:
+        taken = self.actuator is not None and self.actuator.channel == self.sensor.channel
+        require(not taken, "sensor.channel", self.sensor.channel, "another than actuator.channel")
+        check_above_zero(self, "buffer_s")
+
+    @property
+    def inputs(self) -> list[InputChannel]:
+        """In the order in which they are read: actuator, where it is measured, then sensor."""
+        return [self.actuator, self.sensor] if self.actuator else [self.sensor]
+
+
+_PROBES = 1001
+
+
+class CountScale:
+    """Counts to volts, ``volts = sum_k coefficients[k] * counts**k``.
+
+    Parameters
+    ----------
+    channel : nidaqmx.task.channels.AIChannel
+        Its ``ai_dev_scaling_coeff`` are the coefficients, two or more; a sample at the ends of its range, or
+        beyond, is saturated.
+    dtype : numpy.int16 or numpy.int32
+        Of the raw samples.
+
+    Raises
+    ------
+    DeviceError
+        If the coefficients have no slope.
+    """
+
+    def __init__(self, channel: Any, dtype: type[np.signedinteger]) -> None:
+        coefficients = np.array(channel.ai_dev_scaling_coeff, float)
+        if coefficients.size < 2 or coefficients[1] == 0:
+            raise DeviceError(f"nidaqmx: scaling coefficients {coefficients}, expected a slope")
+        self._coefficients = coefficients
+        self._limits_v = float(channel.ai_rng_low), float(channel.ai_rng_high)
+        self._ends = np.iinfo(dtype)
+        offset_v, slope_v = coefficients[:2]
+        low, high = sorted((limit - offset_v) / slope_v for limit in self._limits_v)
+        counts = np.linspace(max(low, self._ends.min), min(high, self._ends.max), _PROBES)
+        bend_v = polynomial.polyval(counts, coefficients) - (offset_v + slope_v * counts)
+        # a bend that no count could show is none
+        self._is_straight = bool(np.max(np.abs(bend_v)) <= 0.5 * abs(slope_v))
+
+    def channel(self, counts: npt.NDArray[np.signedinteger]) -> Channel:
+        """(n,) counts as they are where a straight line converts them, else volts."""
+        volts = polynomial.polyval(counts.astype(float), self._coefficients)
+        saturated = bool(
+            np.any((counts == self._ends.min) | (counts == self._ends.max))
+            or np.any((volts <= self._limits_v[0]) | (volts >= self._limits_v[1]))
+        )
+        if self._is_straight:
+            offset_v, slope_v = map(float, self._coefficients[:2])
+            return Channel(counts.astype(np.int32), slope_v, offset_v, saturated)
+        return Channel(volts, saturated=saturated)
+
 
 _RATE_TOLERANCE = 1e-9
 
@@ -228,7 +376,15 @@ class NiDaqDevice(AcquisitionDevice):
         """Inputs that run until stopped, with a buffer of this many samples per channel."""
         task = self._daq.Task()
         try:
-            channels = [self._add_input(task, channel) for channel in self._config.inputs]
+            channels = [
+                task.ai_channels.add_ai_voltage_chan(
+                    channel.channel,
+                    terminal_config=self._constants.TerminalConfiguration[TERMINALS[channel.terminals]],
+                    min_val=-channel.range_v,
+                    max_val=channel.range_v,
+                )
+                for channel in self._config.inputs
+            ]
             task.timing.cfg_samp_clk_timing(
                 self._rate_hz,
                 sample_mode=self._constants.AcquisitionType.CONTINUOUS,
@@ -245,14 +401,6 @@ class NiDaqDevice(AcquisitionDevice):
             task.close()
             raise
         return task
-
-    def _add_input(self, task: Any, channel: InputChannel) -> Any:
-        return task.ai_channels.add_ai_voltage_chan(
-            channel.channel,
-            terminal_config=self._constants.TerminalConfiguration[TERMINALS[channel.terminals]],
-            min_val=-channel.range_v,
-            max_val=channel.range_v,
-        )
 
     def _make_output(self, period: FloatArray) -> Any:
         """The period, repeated on the inputs' clock from the inputs' start on."""

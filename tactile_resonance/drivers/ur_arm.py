@@ -21,8 +21,12 @@ from tactile_resonance.contact.interfaces import (
 )
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import Six
-from tactile_resonance.drivers.rtde_stream import RtdeStream
-from tactile_resonance.drivers.ur_client_process import ClientProcess
+from tactile_resonance.drivers.rtde_stream import (
+    PROGRAM_PLAYING,
+    RtdeStream,
+    StateReader,
+    stop_fault,
+)
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import (
     FAULTY,
@@ -31,9 +35,9 @@ from tactile_resonance.drivers.ur_exchange import (
     REVIVED,
     SPEED,
     STOP,
+    ClientProcess,
     UrCommand,
 )
-from tactile_resonance.drivers.ur_states import PROGRAM_PLAYING, StateReader, stop_fault
 from tactile_resonance.drivers.ur_time import AskedClock, LedClock, client_name
 
 # An answer to a command takes a few cycles of the robot; longer, and the library hangs.

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 
 from tactile_resonance.clock import Clock, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, Cell
-from tactile_resonance.drivers.ur_client_process import ClientProcess
-from tactile_resonance.drivers.ur_exchange import NOTHING, UrCommand
+from tactile_resonance.drivers.ur_exchange import NOTHING, ClientProcess, UrCommand
 
 if TYPE_CHECKING:
     from tactile_resonance.drivers.ur_arm import UrArm

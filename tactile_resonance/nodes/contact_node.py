@@ -12,12 +12,10 @@ from rclpy.task import Future
 
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
-from tactile_resonance.contact.admission import require_fit
-from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.indentation_record import IndentationRecorder
+from tactile_resonance.contact.cell_checks import require_fit
+from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceInfo, NodeArm
-from tactile_resonance.contact.law import Aim, HoldMode
-from tactile_resonance.contact.loop import Cycle
+from tactile_resonance.contact.loop import Cycle, IndentationRecorder
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import Cause, ContactResult, not_reached, refusal_cause
 from tactile_resonance.contact.samples import Pose

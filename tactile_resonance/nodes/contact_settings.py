@@ -23,9 +23,8 @@ from tactile_resonance.contact.parameters import (
     ranges_of,
     read_contact,
 )
-from tactile_resonance.contact.tip_force import TipForce
-from tactile_resonance.drivers.force_config import CanForce, read_force_config
-from tactile_resonance.drivers.force_sources import force_source
+from tactile_resonance.contact.payload import TipForce
+from tactile_resonance.drivers.force_config import CanForce, force_source, read_force_config
 from tactile_resonance.drivers.twist import TwistConfig
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config

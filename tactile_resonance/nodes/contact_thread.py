@@ -15,7 +15,7 @@ from tactile_resonance.contact.interfaces import ForceError, Mount, NodeArm
 from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import IDLE_PERIODS, ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.tip_force import TipForce
+from tactile_resonance.contact.payload import TipForce
 
 # A tip that cannot be drawn back in this time is left where the envelope stopped it.
 RETRACT_WITHIN_S = 12.0

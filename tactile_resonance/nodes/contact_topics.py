@@ -17,7 +17,7 @@ from std_srvs.srv import SetBool
 from tactile_resonance import msg
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.clock import Clock
-from tactile_resonance.contact.force_over import ForceRecord
+from tactile_resonance.contact.force_spread import ForceRecord
 from tactile_resonance.contact.goal import TARED, State
 from tactile_resonance.contact.resonance_touch import PolesTouch
 from tactile_resonance.contact.samples import WrenchSample

@@ -24,8 +24,7 @@ from tactile_resonance.drivers.acquisition import (
     DeviceError,
     DeviceInfo,
 )
-from tactile_resonance.drivers.nidaq import NiDaqDevice
-from tactile_resonance.drivers.nidaq_config import NiDaqConfig
+from tactile_resonance.drivers.nidaq import NiDaqConfig, NiDaqDevice
 from tactile_resonance.fields import read_file
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.nodes.goals import answer_of

@@ -19,8 +19,7 @@ from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.law import Aim, HoldMode
+from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.frf.result import FRF, PER_LINE, BandBins, BandDistortion, FrfStatus
 from tactile_resonance.multisine import Excitation
@@ -54,7 +53,7 @@ from tactile_resonance.recording.messages import (
 from tactile_resonance.srv import ForceOver
 
 if TYPE_CHECKING:  # nodes without contact control do not load it
-    from tactile_resonance.contact.estimator import ContactEstimate
+    from tactile_resonance.contact.contact_filter import ContactEstimate
     from tactile_resonance.contact.loop import Cycle
     from tactile_resonance.contact.result import ContactResult
     from tactile_resonance.contact.samples import Pose, WrenchSample

@@ -18,7 +18,7 @@ from rclpy.serialization import serialize_message
 from tactile_resonance import msg
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.law import HoldMode
+from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.nodes.goals import POLL_S, Poll, answer_of

@@ -12,7 +12,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:  # nodes that take goals need what may go wrong, and load nothing of scenes and runs for it
-    from tactile_resonance.contact.law import HoldMode
+    from tactile_resonance.contact.goal import HoldMode
     from tactile_resonance.contact.samples import Pose
     from tactile_resonance.frf.result import BandDistortion
     from tactile_resonance.poles.result import Poles

@@ -11,9 +11,8 @@ from functools import cached_property
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.admission import FORCE_SHARE
 from tactile_resonance.contact.force_spread import SHORTEST_S
-from tactile_resonance.contact.parameters import read_contact
+from tactile_resonance.contact.parameters import FORCE_SHARE, read_contact
 from tactile_resonance.fields import counted
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.clearance import is_along, is_plane

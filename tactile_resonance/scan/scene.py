@@ -17,7 +17,7 @@ from typing import Annotated, Any, cast
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.law import HoldMode
+from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.fields import (
     build,
     check_above_zero,

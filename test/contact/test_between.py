@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.goal import Aim, ContactGoal, State
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose

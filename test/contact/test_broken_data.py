@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.goal import Aim, State
 from tactile_resonance.contact.interfaces import ArmFault
-from tactile_resonance.contact.law import Aim
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.cell.transducer import CellParameters

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.contact.payload import Payload, identify_payload
+from tactile_resonance.contact.payload import Mounting, Payload, identify_payload
 from tactile_resonance.contact.samples import CellSample, Pose
-from tactile_resonance.contact.tip_force import Mounting
 from tactile_resonance.contact.vectors import NO_TURN, ZERO, six, vector
 
 G = 9.80665

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.indentation_record import IndentationRecorder
-from tactile_resonance.contact.law import Aim, HoldMode
+from tactile_resonance.contact.goal import Aim, HoldMode, State
+from tactile_resonance.contact.loop import IndentationRecorder
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.mechanics.indentation import BallTip, Protocol
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.contact_living import BONE_ROWS, run_case
-from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.goal import Aim, ContactGoal, State
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.pressing import HeldMotion
 from tactile_resonance.contact.result import Cause
@@ -91,22 +90,26 @@ def test_bone_is_met_below_the_hard_limit_where_nothing_is_known(layer_m, seed):
     assert peak_n(layer_m, QUICK, seed)[0] > 4 * Limits().hard_force_n  # what it would be
 
 
+def is_known(controller, goal):
+    return controller._memory.knows(goal, controller.parameters.known_radius_m)
+
+
 def test_where_one_pressed_too_hard_the_next_touch_is_slow_again():
     made = contact(parameters=replace(QUICK, unknown_speed_m_s=3e-4))
     assert made.loop.make(made.goal).reached
     made.run(0.1)
     assert made.loop.retract().retracted
     controller = made.controller
-    assert controller._is_known(made.goal)
+    assert is_known(controller, made.goal)
     harder = ContactGoal(made.goal.touch, Aim(0.018))
-    assert not controller._is_known(harder)  # as deep as that nobody has been
+    assert not is_known(controller, harder)  # as deep as that nobody has been
     made.bench.plant._on = RigidTip(
         OnBone(made.bench.plant._on.indenter, layer_m=1e-4, radius_m=RADIUS_M)
     )
     made.loop.make(made.goal)
     made.run_until(State.IDLE, 5.0)
     assert controller.result.cause in (Cause.FORCE_ABORT, Cause.FORCE_RATE, Cause.FORCE_HARD)
-    assert not controller._is_known(made.goal)
+    assert not is_known(controller, made.goal)
 
 
 def test_place_is_forgotten_when_pressed_too_hard_whatever_becomes_of_the_tip():
@@ -115,7 +118,7 @@ def test_place_is_forgotten_when_pressed_too_hard_whatever_becomes_of_the_tip():
         assert made.loop.make(made.goal).reached
         assert made.loop.retract().retracted
     controller = made.controller
-    assert controller._is_known(made.goal)
+    assert is_known(controller, made.goal)
     # bone below, and a hook that holds the tip when it is drawn back: `held` is the cause in the end
     bone = OnBone(made.bench.plant._on.indenter, layer_m=1e-4, radius_m=RADIUS_M)
     made.bench.plant._on = RigidTip(Clinging(bone, lambda height_m, _: 40.0 * height_m))
@@ -123,7 +126,7 @@ def test_place_is_forgotten_when_pressed_too_hard_whatever_becomes_of_the_tip():
     made.run_until(State.IDLE, 4.0)
     assert controller.state is State.FAULT
     assert controller.result.cause is Cause.HELD
-    assert not controller._is_known(made.goal)
+    assert not is_known(controller, made.goal)
 
 
 def filtered(read, lag_samples):

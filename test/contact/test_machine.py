@@ -11,11 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.clock import WallClock
-from tactile_resonance.contact.admission import require_fit
+from tactile_resonance.contact.cell_checks import require_fit
 from tactile_resonance.contact.geometry import TipGeometry, touch_pose
-from tactile_resonance.contact.goal import ContactGoal, State
+from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
-from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -184,7 +183,7 @@ def test_a_zero_that_nothing_explains_is_refused_and_a_dish_with_its_sample_is_n
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_fifth_of_the_usual_force_is_held_and_its_loss_is_told(seed):
-    # a source that serves 2 mN by contact.admission: a tenth of it as noise
+    # a source that serves 2 mN by contact.cell_checks: a tenth of it as noise
     cell = replace(CellParameters.from_yaml(), force_noise_rms_n=2e-4, force_divisor=20000.0)
     cell = replace(cell, force_bias_n=(0.0, 0.0, 0.5))  # most of the dish: within its counts
     parameters = replace(QUICK, cell_noise_n=2e-4)

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.goal import Aim, HoldMode, State
 from tactile_resonance.contact.interfaces import ArmFault, ForceFault
-from tactile_resonance.contact.law import Aim, HoldMode
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.cell.transducer import CellParameters

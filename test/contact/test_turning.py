@@ -9,15 +9,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tactile_resonance.contact.geometry import TipGeometry, touch_pose
-from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.geometry import (
+    MARGIN_M,
+    PASSED_RAD,
+    TipGeometry,
+    TipPath,
+    TurningWay,
+    touch_pose,
+)
+from tactile_resonance.contact.goal import Aim, ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample, Pose
-from tactile_resonance.contact.tip_path import MARGIN_M, PASSED_RAD, TipPath, TurningWay
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, RoundSurface

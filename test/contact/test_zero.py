@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.tare import Zero
+from tactile_resonance.contact.observer import Zero
 
 WALK, STD_N, EVERY_S = 5e-5, 9e-5, 2.5
 

@@ -20,7 +20,7 @@ from robot_at_hand import own_time
 
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.law import HoldMode
+from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.nodes import scan_hands
 from tactile_resonance.nodes.contact_node import ContactNode
 from tactile_resonance.nodes.fake_hardware_node import BenchServer, FakeHardwareNode

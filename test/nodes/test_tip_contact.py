@@ -11,7 +11,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
-from tactile_resonance.contact.law import HoldMode
+from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact

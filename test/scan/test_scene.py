@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.law import HoldMode
+from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.scan.decision import Precise, Separate
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import OnFailure, Output, read_scan_scene

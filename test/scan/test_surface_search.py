@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import ContactGoal
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.goal import Aim, ContactGoal
 from tactile_resonance.scan.hands import PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import read_scan_scene

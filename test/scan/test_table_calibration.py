@@ -13,8 +13,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import ContactGoal
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.goal import Aim, ContactGoal
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M

@@ -23,9 +23,8 @@ from tactile_resonance.contact.interfaces import (
     ForceInfo,
     Mount,
 )
-from tactile_resonance.contact.payload import Payload
+from tactile_resonance.contact.payload import Mounting, Payload, TipForce
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
-from tactile_resonance.contact.tip_force import Mounting, TipForce
 from tactile_resonance.contact.vectors import six, vector
 from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
 from tactile_resonance.simulation.noise import Jitter

@@ -8,10 +8,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.indentation_record import IndentationRecorder
-from tactile_resonance.contact.law import Aim, HoldMode
-from tactile_resonance.contact.loop import ContactLoop
+from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
+from tactile_resonance.contact.loop import ContactLoop, IndentationRecorder
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.contact.samples import Pose

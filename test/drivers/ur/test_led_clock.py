@@ -13,8 +13,7 @@ from arms import ACCELERATION_M_S2, CYCLE_NS, PATIENCE_S, UP, LateSocket, nothin
 
 from tactile_resonance.clock import PORT, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
-from tactile_resonance.drivers.force_config import read_force_config
-from tactile_resonance.drivers.rtde_wrench import RtdeWrench
+from tactile_resonance.drivers.force_config import RtdeWrench, read_force_config
 from tactile_resonance.drivers.ur_time import LedClock
 
 pytest.importorskip("can", reason="python-can is not installed")

@@ -13,7 +13,7 @@ import pytest
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
-from tactile_resonance.drivers.rtde_stream import RobotState
+from tactile_resonance.drivers.rtde_stream import RobotState, StateReader, motion_fault
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.drivers.ur_exchange import (
@@ -27,7 +27,6 @@ from tactile_resonance.drivers.ur_exchange import (
     Exchange,
     UrCommand,
 )
-from tactile_resonance.drivers.ur_states import StateReader, motion_fault
 from tactile_resonance.fields import read_dataclass
 from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactile_resonance.contact.observer import TareError, tare
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import WrenchSample
-from tactile_resonance.contact.tare import TareError, tare
 from tactile_resonance.contact.vectors import vector
 
 LIMITS = ContactParameters(

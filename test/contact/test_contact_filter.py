@@ -8,15 +8,17 @@ import pytest
 from scipy.stats import chi2
 
 from tactile_resonance.contact.contact_filter import (
+    RIGID,
     SPEED_LASTS_S,
     SPEED_STD_M_S,
     ContactFilter,
+    hertz_depth,
     hertz_force,
+    touch_posterior,
 )
-from tactile_resonance.contact.estimator import RIGID, TouchDetector, hertz_depth, touch_posterior
-from tactile_resonance.contact.law import force_speed
-from tactile_resonance.contact.observer import ArmModel
+from tactile_resonance.contact.observer import ArmModel, TouchDetector
 from tactile_resonance.contact.parameters import ContactParameters
+from tactile_resonance.contact.pressing import force_speed
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.contact_bench import TipMotion
 from tactile_resonance.simulation.ur5e.machine import TrackingParameters

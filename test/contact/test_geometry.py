@@ -7,12 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tactile_resonance.contact.geometry import TipGeometry, touch_pose
-from tactile_resonance.contact.goal import ContactGoal
-from tactile_resonance.contact.law import Aim
+from tactile_resonance.contact.geometry import (
+    ARRIVED_M,
+    ARRIVING_S,
+    RIGHTING_S,
+    TipGeometry,
+    TipPath,
+    touch_pose,
+)
+from tactile_resonance.contact.goal import Aim, ContactGoal
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import ArmSample
-from tactile_resonance.contact.tip_path import ARRIVED_M, ARRIVING_S, RIGHTING_S, TipPath
 from tactile_resonance.contact.vectors import vector
 
 GOAL = ContactGoal(touch_pose([0.1, -0.2, 0.3], [0.2, -0.1, 1.0], [1, 1, 0], 2.5e-3), Aim(0.01))
