@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.force_spread import joined_spread
-from tactile_resonance.frf.distortion import DETECTING, distortion_in_band
+from tactile_resonance.frf.distortion import DETECTING, distortion_in_band, spectra_between
 from tactile_resonance.frf.estimate import frf_of_realisations
 from tactile_resonance.frf.faults import FaultReport, find_faults, worst_of
 from tactile_resonance.frf.result import FRF, BandBins, FrfStatus, band_bins, stacked_bins
@@ -217,8 +217,7 @@ class MeasurementFrf:
             bins = []
         # the first period is left out: what a polynomial leaves of the transient hides distortion
         detection = [
-            mean_spectra(record, np.arange(lines[0], lines[-1] + 1), method="average")
-            for lines in self._lines_of_bands
+            spectra_between(record, lines, harmonics) for lines in self._lines_of_bands
         ]
         self._spectra[realisation] = spectra, bins, detection
         self._periods[realisation] = periods

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_resonance.frf.distortion import estimate_distortion
+from tactile_resonance.frf.distortion import nonlinear_distortion, spectra_between
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.multisine import Grid, design_multisine
@@ -115,9 +115,8 @@ def test_even_distortion_is_told_in_each_band(square):
     )
     made = excitation(**wide)
     inside = made.harmonics[(made.frequency_hz >= 200) & (made.frequency_hz <= 300)]
-    whole = estimate_distortion(
-        Spectrum.of(u, y), sample_rate_hz=RATE_HZ, harmonics=inside, method="average"
-    )
+    spectra = spectra_between(Spectrum.of(u, y), inside, made.harmonics)
+    whole = nonlinear_distortion(spectra, inside, sample_rate_hz=RATE_HZ)
     assert frfs[-1].distortion[0].even_db == pytest.approx(float(whole.even.rms_level_db))
     assert frfs[-1].distortion[0].input_odd_db == pytest.approx(float(whole.odd.rms_input_level_db))
     # nothing of the kind where every line is excited

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import io, signal
 
-from tactile_resonance.frf.distortion import decibel, nonlinear_distortion
+from tactile_resonance.frf.distortion import decibel, nonlinear_distortion, spectra_between
 from tactile_resonance.frf.spectra import Spectrum, averaged_spectra, transient_free_spectra
 from tactile_resonance.multisine import Grid, harmonics_on_grid
 
@@ -186,3 +186,49 @@ def test_refusals(multisine):
 def test_of_nothing_there_are_no_decibels():
     assert decibel([1.0, 0.0, 100.0]).tolist() == [0.0, -np.inf, 20.0]
     assert np.isnan(decibel(-1e-20))  # what rounding leaves of a variance of exact data
+
+
+def drifting(rng, multisine, periods, *, growth=0.02, cubic=0.0, noise=1e-4):
+    """Spectra, and the first of one realisation whose response grows steadily."""
+    u, y = records(rng, multisine, lambda u: u + cubic * u**3, noise, realisations=1, periods=periods)
+    time = np.arange(periods * SAMPLES).reshape(periods, SAMPLES) / SAMPLES
+    return Spectrum.of(u, y * (1 + growth * time))
+
+
+def between(record):
+    spectra = spectra_between(record, EXCITED, EXCITED)
+    return nonlinear_distortion(spectra, EXCITED, sample_rate_hz=1024.0)
+
+
+def test_a_response_that_drifts_is_no_distortion(multisine):
+    record = drifting(np.random.default_rng(5), multisine, 4)
+    as_mean = nonlinear_distortion(
+        averaged_spectra(record, ALL, unsettled_periods=1), EXCITED, sample_rate_hz=1024.0
+    )
+    assert as_mean.even.above_noise
+    assert as_mean.odd.above_noise
+    found = between(record)
+    assert not found.even.above_noise
+    assert not found.odd.above_noise
+    assert np.abs(found.even.rms_level_db - found.even.rms_noise_level_db) < 2
+
+
+def test_distortion_of_a_response_that_drifts_has_its_level(multisine):
+    level_db = [
+        between(drifting(np.random.default_rng(6), multisine, 4, growth=growth, cubic=0.1)).odd
+        for growth in (0.0, 0.02)
+    ]
+    assert level_db[0].above_noise
+    np.testing.assert_allclose(level_db[1].rms_level_db, level_db[0].rms_level_db, atol=0.1)
+
+
+@pytest.mark.parametrize("periods", [3, 4, 6])
+def test_drift_that_is_estimated_adds_to_the_variance(multisine, periods):
+    """Without drift, noise alone passes for distortion in one of a hundred records, and not in more."""
+    rng = np.random.default_rng(periods)
+    found = [between(drifting(rng, multisine, periods, growth=0.0)) for _ in range(200)]
+    alarms = sum(int(of.even.above_noise) + int(of.odd.above_noise) for of in found)
+    assert alarms <= 12  # of 400; four are expected, more than twelve in one of 2000 runs
+    power = np.mean([of.even.power[of.even.in_band].mean() for of in found])
+    noise = np.mean([of.even.noise_power[of.even.in_band].mean() for of in found])
+    assert power / noise == pytest.approx(1, abs=0.05)
