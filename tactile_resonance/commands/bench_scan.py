@@ -179,12 +179,14 @@ def _new_job(options: argparse.Namespace, scene: str, name: str) -> Job:
 
 def _resumed_job(options: argparse.Namespace) -> Job:
     from tactile_resonance.scan.goal import ScanGoal, resumed_run
+    from tactile_resonance.scan.run_content import read_plan
 
     run = resumed_run(ScanGoal(run_directory=str(options.output.resolve()), resume=True))
     return Job(
         run / "scene.yaml",
         run,
         options.robot_host,
+        int(read_plan(run).facts.get("seed", 1)),
         resume=True,
         real_time=options.real_time,
         calibration=_checked_calibration(options.calibration),
@@ -210,6 +212,8 @@ def run_job(job: Job) -> int:
     from tactile_resonance.commands.plan import read_phantoms
     from tactile_resonance.scan.level_set import LevelSet
     from tactile_resonance.scan.plan import make_plan
+    from tactile_resonance.scan.point_outcome import AFTER
+    from tactile_resonance.scan.point_result import PointOutcome
     from tactile_resonance.scan.run_directory import RunDirectory
     from tactile_resonance.scan.scene import read_scan_scene
 
@@ -223,6 +227,13 @@ def run_job(job: Job) -> int:
         )
     if not job.resume:
         RunDirectory.check_new(job.output, 0)
+    else:
+        with RunDirectory.open(job.output) as run:
+            so_far = run.content
+        if so_far.next_point is None and so_far.paths(reference=AFTER):
+            print(f"{job.output} is complete: nothing is left to measure")
+            report.report_run(job.output)
+            return 0 if any(of.outcome is PointOutcome.DONE for of in so_far.latest) else 1
     job = replace(job, host=take_domain(job.host))
     require_own_domain()
     ended = _Ended()

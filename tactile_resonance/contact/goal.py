@@ -38,6 +38,10 @@ ENDED = (State.RETRACT, State.FAULT)
 """States in which forces do not count any more."""
 
 
+LEAST_FORCE_N = 1e-3
+"""That can be asked of a contact."""
+
+
 class HoldMode(str, Enum):
     """What is kept once the force is reached."""
 
@@ -53,7 +57,8 @@ class Aim:
     hold: HoldMode = HoldMode.FORCE
 
     def __post_init__(self) -> None:
-        require(1e-3 <= self.force_n < math.inf, "force_n", self.force_n, "1 mN or above")
+        good = LEAST_FORCE_N <= self.force_n < math.inf
+        require(good, "force_n", self.force_n, f"{1e3 * LEAST_FORCE_N:g} mN or above")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ robot, no load cell and no control law behind it, and none of their errors.
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 
 import numpy as np
@@ -19,6 +18,7 @@ from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.clock import ClockLostError, SimulatedClock
 from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.parameters import check_goal, read_contact
 from tactile_resonance.contact.result import (
     Cause,
     ContactResult,
@@ -29,6 +29,7 @@ from tactile_resonance.contact.result import (
 from tactile_resonance.nodes.contact_topics import StopInput
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.nodes.messages import (
+    contact_goal,
     contact_result,
     contact_state,
     pose_to_message,
@@ -135,12 +136,9 @@ class IdealContact:
         return reached
 
     def _check(self, request: MakeContact.Goal) -> None:
-        """Raise ``ValueError`` where a goal is refused."""
-        frame = request.pose.header.frame_id
-        if frame != self._base_frame:
-            raise ValueError(f"pose: in frame {frame!r}, accepted is {self._base_frame!r}")
-        if not 0 < request.force_n < math.inf:
-            raise ValueError(f"force_n: {request.force_n:g}, accepted is above 0")
+        """Raise ``ValueError`` where a goal is refused, as contact_node refuses it by default."""
+        goal = contact_goal(request, self._base_frame, self._tip.ball_radius_m)
+        check_goal(goal, *read_contact())
         if self._stop.stopped:
             raise ValueError("goal: refused while the tip is stopped")
         if self._state is not State.IDLE:

@@ -211,6 +211,7 @@ class SimulatedTip:
     Attributes
     ----------
     tip : BenchTip
+    ball_radius_m : float
     stays : Stays
     stalls : int
         How often the simulated robot stood still.
@@ -227,7 +228,7 @@ class SimulatedTip:
         now_ns: Callable[[], int],
     ) -> None:
         self._node, self._bench, self._scene, self.plant = node, bench, scene, plant
-        self.now_ns = now_ns
+        self.now_ns, self.ball_radius_m = now_ns, bench.sensor.tip.radius_m
         table, self.frame_id = values(node, "table_in_base", "frame_id")
         self._laid = LaidScene(scene, pose_of(table, "table_in_base"))
         self.tip, self.stays, self.stalls = BenchTip(None, 0.0, 1.0), Stays(), 0

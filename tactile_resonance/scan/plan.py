@@ -12,6 +12,7 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.force_spread import SHORTEST_S
+from tactile_resonance.contact.goal import LEAST_FORCE_N
 from tactile_resonance.contact.parameters import FORCE_SHARE, read_contact
 from tactile_resonance.fields import counted
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
@@ -41,6 +42,8 @@ from tactile_resonance.sensor import MAX_LEVEL_V
 
 STEEPEST_RAD = np.pi / 3
 TRAVEL_M_S = 0.05
+LEAST_GATE_N = 2e-4
+"""A gate below this closes on the noise of a load cell of 1 mN at 1 kHz [N]."""
 CONTACT_S, NEAR_CONTACT_S = 2.2, 1.1
 """Of each point, as seen on the simulated bench: tare, approach, until the force is held, and back; the second
 where the surface was touched near by."""
@@ -111,7 +114,15 @@ class Plan:
         return self.duration_s(self.measurement.blocks.most)
 
     def duration_s(self, blocks: int, points: int | None = None) -> float:
-        """Time of so many points, by default the most, with so many blocks each [s].
+        """Time of so many points, by default the most, with so many blocks each, and their tests [s]."""
+        count = self.most_points if points is None else points
+        tests_s = sum(
+            asked.longest_s * (len(asked.points) or count) for asked in self.scene.protocols
+        )
+        return count * self.point_s(blocks) + tests_s
+
+    def point_s(self, blocks: int) -> float:
+        """Mean time of a point with so many blocks, without its tests [s].
 
         Ways that are not known yet count as the mean of those that are.
         """
@@ -119,11 +130,7 @@ class Plan:
         travel_m = float(np.sum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
         contact_s = len(position) * CONTACT_S - self.near * (CONTACT_S - NEAR_CONTACT_S)
         each_s = (travel_m / TRAVEL_M_S + contact_s) / len(position)
-        count = self.most_points if points is None else points
-        tests_s = sum(
-            asked.longest_s * (len(asked.points) or count) for asked in self.scene.protocols
-        )
-        return count * (each_s + blocks * self.measurement.block_s) + tests_s
+        return each_s + blocks * self.measurement.block_s
 
     def next_point(
         self, touched: Sequence[ScanPoint], results: Iterable[PointResult]
@@ -334,7 +341,7 @@ def _period(plan: Plan) -> str:
 def _limits(plan: Plan) -> list[str]:
     """What will end the scan or its points before they are complete."""
     limits, level_v = plan.scene.time_limits, plan.measurement.level_v
-    point_s = plan.duration_s(plan.measurement.blocks.least, 1)
+    point_s = plan.point_s(plan.measurement.blocks.least)
     texts = []
     if limits.scan_s < plan.shortest_s:
         texts.append(
@@ -349,8 +356,24 @@ def _limits(plan: Plan) -> list[str]:
     most_n = FORCE_SHARE * of_contact.abort_force_n
     if plan.scene.force_n > most_n * (1 + 1e-9):
         texts.append(
-            f"force_n: {plan.scene.force_n:g} N, contact_node refuses more than two thirds of its "
-            f"limits.abort_force_n, by default {most_n:g} N: points fail"
+            f"force_n: {plan.scene.force_n:g} N, contact_node refuses more than {most_n:g} N, two thirds of "
+            "its limits.abort_force_n, by default: points fail"
+        )
+    if plan.scene.force_n < LEAST_FORCE_N:
+        texts.append(
+            f"force_n: {plan.scene.force_n:g} N, contact_node refuses less than {LEAST_FORCE_N:g} N: points "
+            "fail; forces are in newtons"
+        )
+    texts += [
+        f"protocols: {asked}: contact_node holds for {of_contact.hold_s:g} s at most, its limits.hold_s, by "
+        "default: not tested"
+        for asked in plan.scene.protocols
+        if asked.hold_s > of_contact.hold_s
+    ]
+    if plan.scene.gate is not None and plan.scene.gate.force_rms_n < LEAST_GATE_N:
+        texts.append(
+            f"gate.force_rms_n: {plan.scene.gate.force_rms_n:g} N; the noise of a cell of 1 mN closes a gate "
+            f"below {LEAST_GATE_N:g} N: points fail"
         )
     away_m = max((math.hypot(*point.position_m[:2]) for point in plan.points), default=0.0)
     most_m = math.hypot(*of_contact.workspace.high_m[:2])

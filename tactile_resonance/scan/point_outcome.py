@@ -336,7 +336,7 @@ PARTS = {
     "rest for the tare": "tare_s",
     "travel": "travel_s",
     "drawing back": "retract_s",
-    "requests and answers": "",
+    "tests, requests and answers": "",
 }
 """What `duration_s` is made of, and the field that holds it; empty: what is left."""
 BETWEEN = "between points"
@@ -354,7 +354,7 @@ def time_budget(results: Iterable[PointResult]) -> Mapping[str, np.ndarray]:
     told = {name: of(field) for name, field in PARTS.items() if field}
     told["waiting in contact"] = of("hold_s") - of("vibration_s")
     in_contact = sum((of(name) for name in dict.fromkeys(FIELD_OF.values())), np.zeros(len(known)))
-    told["requests and answers"] = of("duration_s") - in_contact
+    told["tests, requests and answers"] = of("duration_s") - in_contact
     return {**{name: told[name] for name in PARTS}, BETWEEN: np.nan_to_num(of("between_s"))}
 
 

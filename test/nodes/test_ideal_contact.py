@@ -221,8 +221,10 @@ def test_a_contact_is_made_held_told_and_drawn_back(ideal):
 @pytest.mark.parametrize(
     ("change", "cause", "message"),
     [
-        ({"force_n": -0.01}, "refused", "force_n: -0.01, accepted is above 0"),
-        ({"force_n": math.nan}, "refused", "force_n: nan"),
+        ({"force_n": -0.01}, "refused", "force_n: got -0.01; accepted is 1 mN or above"),
+        ({"force_n": math.nan}, "refused", "force_n: got nan"),
+        ({"force_n": 0.5}, "refused", "force_n: got 0.5; accepted is up to 0.02, two thirds of"),
+        ({"z_m": 2.0}, "refused", "touch: its standoff"),
         ({"x_m": 0.03}, "surface_missing", "nothing to touch there"),
     ],
 )

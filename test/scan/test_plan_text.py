@@ -11,11 +11,13 @@ import pytest
 
 from tactile_resonance.cli import main
 from tactile_resonance.configuration import share_path
+from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.poles.structure import PoleBand
-from tactile_resonance.scan.decision import BlockLimits, Precise, Verdict, decide
+from tactile_resonance.scan.decision import BlockLimits, Gate, Precise, Verdict, decide
 from tactile_resonance.scan.plan import make_plan, plan_against_outcome, plan_rows
 from tactile_resonance.scan.scene import Output, TimeLimits, read_run_scene, read_scan_scene
 from tactile_resonance.scan.surface import NormalRequest, TouchRequest
+from tactile_resonance.scan.tissue_tests import ProtocolRequest
 from tactile_resonance.tissue.nominal_contact import ContactLoad
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -126,6 +128,15 @@ def test_a_plan_names_each_limit_that_its_scan_would_meet():
     assert level.startswith("sensor.level_v: ")
     (force,) = told(replace(asked, force_n=0.5))["limit"]
     assert force.startswith("force_n: 0.5 N, contact_node refuses more than")
+    (little,) = told(replace(asked, force_n=1e-5))["limit"]
+    assert little.startswith("force_n: 1e-05 N, contact_node refuses less than 0.001 N")
+    (gate,) = told(replace(asked, gate=Gate(force_rms_n=1e-5)))["limit"]
+    assert gate.startswith("gate.force_rms_n: 1e-05 N;")
+    long = ProtocolRequest(Protocol.RELAXATION, hold_s=500.0)
+    (held,) = told(replace(asked, protocols=(long,)))["limit"]
+    assert held.startswith("protocols: relaxation of 500 s at every point: contact_node holds for 120 s")
+    tested = replace(asked, protocols=(replace(long, hold_s=100.0),))
+    assert "limit" not in told(tested)  # time_limits.point_s, 60 s, is of the poles alone
     limits = told(replace(asked, positions_m=1e3 * asked.positions_m))["limit"]
     assert any(text.startswith("positions: up to 2 m from the origin") for text in limits)
 

@@ -192,7 +192,7 @@ def test_parts_of_the_time_add_up_to_the_points_and_the_time_between_them():
     budget = time_budget(results)
     np.testing.assert_allclose(np.sum(list(budget.values()), axis=0), [2.4, 2.7])
     np.testing.assert_allclose(budget["waiting in contact"], 0.1)
-    np.testing.assert_allclose(budget["requests and answers"], [0.1, 0.3])
+    np.testing.assert_allclose(budget["tests, requests and answers"], [0.1, 0.3])
     np.testing.assert_allclose(budget[BETWEEN], [0.1, 0.2])
     sentence = budget_sentence(results)
     assert sentence.startswith("A point took 2.55 s (mean): vibration 0.80, approach 0.40,")
