@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from action_msgs.msg import GoalStatus
+from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import Point, Pose, PoseArray
 from rclpy.action.client import ClientGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -179,6 +180,10 @@ class TactileClient:
         self._scans = GoalClient(node, Scan, f"{prefix}scan", callback_group=group)
         name = f"{prefix}calibrate_table"
         self._calibrations = GoalClient(node, CalibrateTable, name, callback_group=group)
+        self._cancel = [
+            node.create_client(CancelGoal, f"{prefix}{name}/_action/cancel_goal", callback_group=group)
+            for name in ("scan", "calibrate_table")
+        ]
         self._services = {
             name: node.create_client(Trigger, f"{prefix}scan/{name}", callback_group=group)
             for name in ("pause", "resume", "skip_point", "repeat_point", "rejection")
@@ -301,10 +306,17 @@ class TactileClient:
         )
 
     def cancel(self) -> None:
-        """End the scan or calibration after drawing the tip back; its future is done when that is."""
+        """End the scan or calibration after drawing the tip back; its future is done when that is.
+
+        Of a client that has none under way: that which another client began, and may have left behind.
+        """
         if self._asked is not None:
             self._asked.cancelled = True
             self._asked.send_cancellation()
+            return
+        for cancel in self._cancel:
+            if cancel.service_is_ready():
+                cancel.call_async(CancelGoal.Request())  # without an id: all goals
 
     def pause(self) -> Future:
         """Wait with the tip free once the point under way is finished; as all below, a `Trigger.Response`."""
@@ -326,7 +338,7 @@ class TactileClient:
         """Take everything off the node again; a scan under way goes on, and is followed no longer."""
         self._node.destroy_timer(self._timer)
         self._node.destroy_subscription(self._points)
-        for service in self._services.values():
+        for service in (*self._services.values(), *self._cancel):
             self._node.destroy_client(service)
         self._scans.destroy()
         self._calibrations.destroy()

@@ -13,7 +13,7 @@ from tactile_resonance.analysis import Analysis, analyse, analysis_content
 from tactile_resonance.calibration.contact import ContactStatus, Law, Moduli, TissueContact, moduli
 from tactile_resonance.calibration.estimator import CalibratedEstimator, ContactRecord
 from tactile_resonance.calibration.model import CalibratedSensor, read_calibration
-from tactile_resonance.fields import band, known, number, require, require_kind
+from tactile_resonance.fields import band, known, number, read, require, require_kind
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.result import Poles
@@ -146,7 +146,8 @@ def estimate_contact(
     )
     lines = int(np.count_nonzero(record.excited))
     require(lines > 2, "band_hz", band_hz, f"a band of three excited lines or more ({lines} found)")
-    contact = CalibratedEstimator(calibrated.calibration, calibrated.tip_radius_m, Law(law))(
+    of_kind = law if isinstance(law, Law) else read(Law, law, "law")
+    contact = CalibratedEstimator(calibrated.calibration, calibrated.tip_radius_m, of_kind)(
         record, force_n, force_std_n
     )
     black_box = None

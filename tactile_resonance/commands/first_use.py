@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`tactile_resonance check-robot` and `compile`: what is done once, before a robot and fits are first used."""
+"""`tactile_resonance check-robot` and `compile`: what is done before a robot, and fits, are first used."""
 
 from __future__ import annotations
 

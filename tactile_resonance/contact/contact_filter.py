@@ -16,8 +16,8 @@ follow it.
 
 It begins with an estimate on a grid from the samples around the touch.
 
-The control loop does this for every force, so it is compiled. numba looks at the date of this file alone:
-whatever is compiled for the filter is in here.
+The control loop runs the filter for every force, so that is compiled. numba looks at the date of this file
+alone: whatever is compiled for the filter is in here.
 """
 
 from __future__ import annotations

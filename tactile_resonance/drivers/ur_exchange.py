@@ -16,6 +16,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -172,11 +173,11 @@ class ClientProcess:
         self._ended = False
         self._probed_ns, self._probes_ns = 0, 0 if simulated_time else PROBES_NS
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with open(os.memfd_create("page"), "w+b") as page, theirs:
+        with tempfile.TemporaryFile() as page, theirs:
             page.truncate(SIZE)
             self.exchange = Exchange(page.fileno())
             self.exchange.beat()
-            self._errors = open(os.memfd_create("errors"), "w+b")  # noqa: SIM115 - lives as long as the client
+            self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the client
             self._commands = ours
             self._process = subprocess.Popen(
                 [

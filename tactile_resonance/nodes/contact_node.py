@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Brings the tip to the tissue, holds the force, draws it back; a process and a loop of its own."""
+"""Brings the tip to the tissue, holds the force, draws it back, tests tissue; in a process of its own."""
 
 from __future__ import annotations
 

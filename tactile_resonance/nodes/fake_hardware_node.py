@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated bench: plays excitations on the bimorph, in contact with whatever lies under the tip."""
+"""The simulated bench: its time; excitations played on the bimorph, in contact with what lies under the tip."""
 
 from __future__ import annotations
 

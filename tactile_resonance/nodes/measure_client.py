@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -23,15 +22,13 @@ from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import NO_RECORDS, each_to_message
+from tactile_resonance.nodes.node_watch import ScanTime
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.recording.messages import GRIDS, each_from_message, time_from_message
 from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed, ScanEnded
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.point_file import offered_qos
 from tactile_resonance.scan.run_directory import PointRecording
-
-if TYPE_CHECKING:
-    from tactile_resonance.nodes.scan_hands import ScanTime
 
 DEVICE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0

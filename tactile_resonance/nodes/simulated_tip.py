@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the tip of the simulated sensor touches: as goals or poses put it, or as the simulated robot has it.
 
+The robot is a process of its own (`PlantChild`).
 The true poles there are on the topic `bench/truth` and behind the service `bench/get_truth`.
 """
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import SetBool, Trigger
@@ -18,6 +18,7 @@ from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll, answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import HOLDS
+from tactile_resonance.nodes.node_watch import ScanTime
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.recording.messages import PROTOCOLS, time_from_message
 from tactile_resonance.scan.hands import (
@@ -33,9 +34,6 @@ from tactile_resonance.scan.hands import (
 )
 from tactile_resonance.scan.point_outcome import StateTimes
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
-
-if TYPE_CHECKING:
-    from tactile_resonance.nodes.scan_hands import ScanTime
 
 STATE_TOPIC = "contact_state"
 UNKNOWN = msg.ContactState(tissue_moves_m=math.nan, zero_moved_n=math.nan)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A force sensor of any ROS 2 driver: its geometry_msgs/WrenchStamped."""
+"""A force sensor of any ROS 2 driver: its geometry_msgs/WrenchStamped; how far messages have arrived."""
 
 from __future__ import annotations
 

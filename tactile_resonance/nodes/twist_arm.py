@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`TwistArm`: an arm that somebody else's controller moves by geometry_msgs/TwistStamped (docs/twist.md)."""
+"""An arm that somebody else's controller moves by geometry_msgs/TwistStamped, also in step with simulated time.
+
+See docs/twist.md.
+"""
 
 from __future__ import annotations
 

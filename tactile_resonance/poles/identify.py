@@ -297,11 +297,14 @@ def _checked_frf(frf: FRF) -> FRF:
         variance = variances[name] = getattr(frf, name)
         if variance is None:
             continue
+        values = _numbers(variance, f"frf.{name}", float)
+        if np.any(values < 0):
+            raise ValueError(f"frf.{name}: {np.nanmin(values):g}, expected none below 0")
         try:
-            variances[name] = np.broadcast_to(np.asarray(variance, float), g.shape)
+            variances[name] = np.broadcast_to(values, g.shape)
         except ValueError:
             raise ValueError(
-                f"frf.{name}: shape {np.shape(variance)}, expected that of g, {g.shape}"
+                f"frf.{name}: shape {values.shape}, expected that of g, {g.shape}"
             ) from None
         _check_dof(getattr(frf, dof_name), f"frf.{dof_name}")
     return replace(frf, frequency_hz=frequency_hz, g=g, **variances)
@@ -371,10 +374,13 @@ def _checked_band(
 
 def _numbers(values: npt.ArrayLike, name: str, kind: type) -> npt.NDArray:
     """Array of a kind; ``ValueError`` naming the field where the values are no array of numbers."""
+    real = kind is float
     try:
-        return np.asarray(values, kind)
+        array = np.asarray(values)
+        require(not real or array.dtype.kind in "biuf", name, array.dtype, "an array of real numbers")
+        return np.asarray(array, kind)
     except (TypeError, ValueError):
-        require(False, name, values, "an array of numbers")
+        require(False, name, values, f"an array of {'real ' if real else ''}numbers")
         raise
 
 

@@ -353,7 +353,7 @@ class PoleEstimator(JointPlan):
         """
         u, y = self._checked(u, y)
         if y.ndim < 2:
-            raise ValueError(f"u, y: shape {y.shape}, expected (..., M, {self.bins.size})")
+            raise ValueError("u, y: one record, expected (..., M) records of M realisations")
         records = y.shape[-2]
         if records == 1:
             return self._single.from_bins(u[..., 0, :], y[..., 0, :])

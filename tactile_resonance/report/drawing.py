@@ -63,7 +63,7 @@ def save_figure(figure: Figure, path: Path) -> None:
     write_whole(path, figure_bytes(figure, path.suffix))
 
 
-def draw_ellipse(
+def _draw_ellipse(
     axes: Axes,
     centre: npt.ArrayLike,
     covariance: FloatArray,
@@ -112,7 +112,7 @@ def draw_analysis(analysis: Analysis, title: str) -> Figure:
             (poles.covariance, "C0", "95 %, noise"),
         ):
             if covariance is not None:
-                draw_ellipse(
+                _draw_ellipse(
                     pole_axes, (f0_hz, damping_ratio), covariance[k], color=colour, label=name
                 )
     pole_axes.set(
@@ -207,14 +207,14 @@ def _draw_case(axes: Axes, distortion: Distortion) -> None:
         lines = getattr(distortion, name)
         if lines.harmonics.size == 0:
             continue
-        _dots(axes, lines.frequency_hz, lines.power, _label(name, lines), 1.5, color=colour)
+        _dots(axes, lines.frequency_hz, lines.power, _parity_label(name, lines), 1.5, color=colour)
         if name == "even" and not np.all(np.isnan(lines.noise_power)):
             _dots(axes, lines.frequency_hz, lines.noise_power, "noise", 1.5, color="0.6")
     axes.legend(fontsize="small", markerscale=4, loc="lower left")
     axes.grid(alpha=0.3)
 
 
-def _label(name: str, lines: DetectionLines) -> str:
+def _parity_label(name: str, lines: DetectionLines) -> str:
     """Level of a parity, and whether it is more than noise: noise must not pass for distortion."""
     level = f"{float(np.max(lines.rms_level_db)):.1f} dB"
     if lines.above_noise is None:
@@ -323,7 +323,7 @@ def draw_poles(axes: Axes, points: ReferencePoints, spreads: Sequence[TissueSpre
     for k, spread in enumerate(spreads):
         own = points.of(spread.name)
         axes.plot(*own.estimate.T, ".", ms=3, color=f"C{k}", label=spread.name)
-        draw_ellipse(axes, spread.mean, spread.covariance + spread.noise, color=f"C{k}", lw=1)
+        _draw_ellipse(axes, spread.mean, spread.covariance + spread.noise, color=f"C{k}", lw=1)
     axes.set(
         xlabel="f0 [Hz]", ylabel="damping ratio", title="Poles, and where 95 % are, if Gaussian"
     )
@@ -368,7 +368,7 @@ def draw_comparison(
         label = f"group {k + 1}: {counted(int(own.sum()), 'point')}"
         places.plot(*(1e3 * position_m[own].T), "o", color=f"C{k}", ms=5, label=label)
         poles.plot(*estimates[own].T, ".", color=f"C{k}")
-        draw_ellipse(
+        _draw_ellipse(
             poles,
             groups.mean[k],
             groups.covariance[k] + covariances[own].mean(axis=0)
@@ -417,7 +417,7 @@ def draw_tests(tests: Sequence[TissueTest], title: str) -> Figure:
     over_time, over_depth = figure.subplots(1, 2)
     creep = all(one.test.protocol is Protocol.CREEP for one in shown)
     for k, one in enumerate(shown):
-        _draw(over_time, over_depth, one, f"C{k % 10}", creep)
+        _draw_test(over_time, over_depth, one, f"C{k % 10}", creep)
     over_time.set(
         xlabel="time from the touch [s]",
         ylabel="depth of the ball [mm]" if creep else "force / its largest [%]",
@@ -435,7 +435,7 @@ def draw_tests(tests: Sequence[TissueTest], title: str) -> Figure:
     return figure
 
 
-def _draw(over_time: Axes, over_depth: Axes, one: TissueTest, colour: str, creep: bool) -> None:
+def _draw_test(over_time: Axes, over_depth: Axes, one: TissueTest, colour: str, creep: bool) -> None:
     fit, test = one.fit, one.test
     assert fit is not None
     share = 100 / fit.peak_force_n

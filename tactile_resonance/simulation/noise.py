@@ -60,15 +60,15 @@ class Jitter:
     """
 
     def __init__(self, rms_m: float, corner_rad_s: float, period_s: float, seed: Seed) -> None:
-        rms, w, t = rms_m, corner_rad_s, period_s
+        w, t = corner_rad_s, period_s
         fall = math.exp(-w * t)
         transition = fall * np.array([[1 + w * t, t], [-(w**2) * t, 1 - w * t]])
-        stationary = rms**2 * np.diag([1.0, w**2])
+        stationary = rms_m**2 * np.diag([1.0, w**2])
         driven = stationary - transition @ stationary @ transition.T
         # tiny negative eigenvalues are rounding
         values, vectors = np.linalg.eigh(driven)
         drive = vectors * np.sqrt(np.maximum(values, 0))
-        self._rms = np.array([rms, rms * w])  # of place and speed
+        self._rms = np.array([rms_m, rms_m * w])  # of place and speed
         self._by = np.ascontiguousarray(np.hstack([transition, drive]))
         self.reseed(seed)
 

@@ -73,18 +73,18 @@ class TissueCall:
     reason: str = ""
 
 
-def class_from_samples(name: str, estimates: npt.ArrayLike, prior: float = 1.0) -> TissueClass:
+def class_from_samples(name: str, points: npt.ArrayLike, prior: float = 1.0) -> TissueClass:
     """Class of measured reference points.
 
     Parameters
     ----------
-    estimates : (n, 2) float
+    points : (n, 2) float
         f0 [Hz] and damping ratio of n points of this tissue, n at least 4; their scatter holds the noise
         of those measurements too, which is on the safe side.
     """
-    x = np.asarray(estimates, float)
+    x = np.asarray(points, float)
     good = x.ndim == 2 and x.shape[1] == 2 and len(x) >= 4 and bool(np.all(np.isfinite(x)))
-    require(good, "estimates", x.shape, "shape (n, 2) with n at least 4, finite")
+    require(good, "points", x.shape, "shape (n, 2) with n at least 4, finite")
     n = len(x)
     return predictive_class(name, x.mean(axis=0), (1 + 1 / n) * np.cov(x.T), n - 1.0, prior)
 

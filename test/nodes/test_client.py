@@ -310,6 +310,23 @@ def test_a_goal_whose_node_goes_away_before_a_run_is_lost_without_one(kind):
     assert (type(lost), lost.ending, lost.message) == (kind, Ending.LOST, "scan_node went away")
 
 
+def test_a_scan_that_another_client_left_behind_can_be_cancelled(stack):
+    stack.activate()
+    future = stack.begin([])
+    other = TactileClient(stack.user)
+    try:
+        # what is under way keeps others out
+        refused = other.scan(**GOAL)
+        stack.until(refused.done)
+        assert refused.result().ending is Ending.REJECTED
+        assert "cancel it or wait" in refused.result().message
+        other.cancel()
+        assert stack.ended(future).ending is Ending.CANCELLED
+        other.cancel()  # nothing is there to be cancelled
+    finally:
+        other.destroy()
+
+
 def test_a_run_that_began_with_another_table_is_not_resumed(stack):
     stack.activate()
     future = stack.begin([], run_directory="mine")

@@ -26,10 +26,10 @@ from tactile_resonance.nodes.contact_node import ContactNode
 from tactile_resonance.nodes.fake_hardware_node import BenchServer, FakeHardwareNode
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
 from tactile_resonance.nodes.messages import poles_to_message
-from tactile_resonance.nodes.node_watch import SILENT_S
+from tactile_resonance.nodes.node_watch import SILENT_S, ScanTime
 from tactile_resonance.nodes.parameters import Fixed
 from tactile_resonance.nodes.running import initialised
-from tactile_resonance.nodes.scan_hands import NodeHands, ScanTime
+from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.processes import free_domain_id

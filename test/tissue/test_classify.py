@@ -134,5 +134,5 @@ def test_classes_need_names_of_their_own():
     fields = {"f0_hz": 250, "damping_ratio": 0.03, "f0_std_hz": 1, "damping_ratio_std": 1}
     with pytest.raises(ValueError, match=r"classes.a.correlation: got 2.0; accepted is -1 to 1"):
         parse_classes({"a": {**fields, "correlation": 2.0}}, "classes")
-    with pytest.raises(ValueError, match="classes.a.estimates: .*n at least 4"):
+    with pytest.raises(ValueError, match="classes.a.points: .*n at least 4"):
         parse_classes({"a": {"points": [[250, 0.03]]}}, "classes")

@@ -39,8 +39,8 @@ FORCE_MODE_STOP = 10.0
 class Handlers:
     """What commands do that move the arm or set something; a generator where that takes time."""
 
-    def __init__(self, script: Program, machine: Machine) -> None:
-        self._script = script
+    def __init__(self, program: Program, machine: Machine) -> None:
+        self._program = program
         self._machine = machine
         self._target = machine.target
         # linear or in the joints; the client's program sets this by asynchronous stops alone
@@ -52,47 +52,47 @@ class Handlers:
 
     def move(self, run: Callable[[Target, Any, float, float], Thread], goal: Any) -> Thread:
         """Move to joint angles or a pose, asynchronously where integer 1 says so."""
-        script = self._script
-        work = run(self._target, goal, script.double(7), script.double(6))
+        program = self._program
+        work = run(self._target, goal, program.double(7), program.double(6))
         self._stop_asynchronous_move()
-        if script.integer(1) == 1:
-            script.run("move", self._told(work))
+        if program.integer(1) == 1:
+            program.run("move", self._told(work))
         else:
             yield from work
 
     def _told(self, work: Thread) -> Thread:
         """Run a motion as an asynchronous operation, and report its begin and end to the client."""
-        self._script.begin_asynchronous()
+        self._program.begin_asynchronous()
         yield from work
-        self._script.end_asynchronous()
+        self._program.end_asynchronous()
 
     def _stop_asynchronous_move(self) -> None:
-        if self._script.kill("move"):
-            self._script.end_asynchronous()
+        if self._program.kill("move"):
+            self._program.end_asynchronous()
 
     def stop(self) -> Thread:
         """Stop, asynchronously where integer 1 says so."""
-        script = self._script
-        if script.kill("stop"):
-            script.end_asynchronous()
+        program = self._program
+        if program.kill("stop"):
+            program.end_asynchronous()
         else:
             self._stop_asynchronous_move()
-        asynchronous = script.integer(1) == 1
+        asynchronous = program.integer(1) == 1
         if asynchronous:
             self._stop_linear = True
         stop = motion.stopl if self._stop_linear else motion.stopj
-        work = stop(self._target, script.double(0))
+        work = stop(self._target, program.double(0))
         if asynchronous:
-            script.run("stop", self._told(work))
+            program.run("stop", self._told(work))
         else:
             yield from work
 
     def speed(self, run: SpeedMotion) -> None:
         """Move the TCP with a twist, or the joints with speeds, until the next command."""
-        script = self._script
-        self._speed = (run, script.doubles(0), script.double(6), script.double(7))
-        if "speed" not in script.threads:
-            script.run("speed", self._speeding())
+        program = self._program
+        self._speed = (run, program.doubles(0), program.double(6), program.double(7))
+        if "speed" not in program.threads:
+            program.run("speed", self._speeding())
 
     def _speeding(self) -> Thread:
         # A new speed is taken up when the time of the last one is over, not before.
@@ -102,19 +102,19 @@ class Handlers:
 
     def speed_stop(self) -> Thread:
         """End a motion with a speed."""
-        self._script.kill("speed")
+        self._program.kill("speed")
         stop = motion.stopl if self._speed[0] is motion.speedl else motion.stopj
-        return stop(self._target, self._script.double(0))
+        return stop(self._target, self._program.double(0))
 
     def servo(self, goal: Six) -> None:
         """Follow joint angles."""
-        script = self._script
-        gain = script.double(10)
+        program = self._program
+        gain = program.double(10)
         if not 100 <= gain <= 2000:
             raise ScriptError(f"servoj: gain {gain:g}; accepted is 100 to 2000")
-        self._servo = (goal, script.double(8), script.double(9))
-        if "servo" not in script.threads:
-            script.run("servo", self._servoing())
+        self._servo = (goal, program.double(8), program.double(9))
+        if "servo" not in program.threads:
+            program.run("servo", self._servoing())
 
     def _servoing(self) -> Thread:
         while True:
@@ -122,13 +122,13 @@ class Handlers:
 
     def servo_stop(self) -> Thread:
         """End following."""
-        self._script.kill("servo")
-        return motion.stopl(self._target, self._script.double(0))
+        self._program.kill("servo")
+        return motion.stopl(self._target, self._program.double(0))
 
     def move_until_contact(self) -> Thread:
         """Move with a twist until the tool touches something, and back to where it did."""
-        script = self._script
-        speed, direction, acceleration = script.doubles(0), script.vector(6), script.double(12)
+        program = self._program
+        speed, direction, acceleration = program.doubles(0), program.vector(6), program.double(12)
         while (steps := self._machine.contact_steps(direction)) == 0:
             yield from motion.speedl(self._target, speed, acceleration, CYCLE_S)
         yield from self._return(steps)
@@ -142,8 +142,8 @@ class Handlers:
 
     def start_contact(self) -> None:
         """Watch for a contact along a direction; zero: along the motion."""
-        self._script.kill("contact")
-        self._script.run("contact", self._watching(self._script.vector(0)))
+        self._program.kill("contact")
+        self._program.run("contact", self._watching(self._program.vector(0)))
 
     def _watching(self, direction: Vector) -> Thread:
         """Wait until nothing is touched, then for a contact; zero: along the motion."""
@@ -159,16 +159,16 @@ class Handlers:
         while (found := steps()) == 0:
             yield
         self._contact_steps = found
-        self._script.internal_command = CONTACT_FOUND
+        self._program.internal_command = CONTACT_FOUND
 
     def stop_contact(self) -> None:
         """End watching; how many cycles ago a contact began, 0 for none."""
-        self._script.kill("contact")
-        self._script.answer(self._contact_steps)
+        self._program.kill("contact")
+        self._program.answer(self._contact_steps)
 
     def read_contact(self) -> None:
         """How many cycles before it was found a contact began, 0 for none."""
-        self._script.answer(self._contact_steps)
+        self._program.answer(self._contact_steps)
 
     def back_to_contact(self) -> Thread:
         """Stop and go back to where the contact began."""
@@ -177,15 +177,15 @@ class Handlers:
 
     def start_jog(self) -> None:
         """Move with a twist in the base, the tool or another frame."""
-        script = self._script
-        axes = [NO_TURN, self._machine.tcp[0], script.pose(8)[0]]
-        feature = round(script.double(6))
+        program = self._program
+        axes = [NO_TURN, self._machine.tcp[0], program.pose(8)[0]]
+        feature = round(program.double(6))
         if feature not in (0, 1, 2):
             raise ScriptError(f"jog: feature {feature}; accepted are 0 base, 1 tool, 2 custom")
         turn = axes[feature]
-        self._jog_twist = (*rotated(turn, script.vector(0)), *rotated(turn, script.vector(3)))
-        if "jog" not in script.threads:
-            script.run("jog", self._jogging(script.double(7)))
+        self._jog_twist = (*rotated(turn, program.vector(0)), *rotated(turn, program.vector(3)))
+        if "jog" not in program.threads:
+            program.run("jog", self._jogging(program.double(7)))
 
     def _jogging(self, acceleration: float) -> Thread:
         while True:
@@ -193,15 +193,15 @@ class Handlers:
 
     def stop_jog(self) -> Thread:
         """End jogging."""
-        self._script.kill("jog")
+        self._program.kill("jog")
         return motion.stopl(self._target, 1.2)
 
     def force_mode(self) -> None:
         """Give way along chosen axes until pressing with a wrench."""
-        script = self._script
-        selection = tuple([script.integer(2 + axis) == 1 for axis in range(6)])
+        program = self._program
+        selection = tuple([program.integer(2 + axis) == 1 for axis in range(6)])
         task = ForceTask(
-            script.pose(), selection, script.doubles(6), script.integer(1), script.doubles(12)
+            program.pose(), selection, program.doubles(6), program.integer(1), program.doubles(12)
         )
         self._machine.force_mode.begin(task)
 
@@ -212,14 +212,14 @@ class Handlers:
 
     def set_force_mode(self, name: str, most: float) -> None:
         """Set a figure of force mode."""
-        value = self._script.double(0)
+        value = self._program.double(0)
         if not 0.0 <= value <= most:
             raise ScriptError(f"force_mode_set_{name}: {value:g}; accepted is 0 to {most:g}")
         setattr(self._machine.force_mode, name, value)
 
     def set_payload(self, inertia: Six) -> None:
         """Set mass and centre of gravity of what the flange carries."""
-        mass, cog = self._script.double(0), self._script.vector(1)
+        mass, cog = self._program.double(0), self._program.vector(1)
         if not mass >= 0.0:
             raise ScriptError(f"set_payload: mass {mass:g}; accepted is 0 kg or above")
         if not any(cog):  # the client's program keeps the centre of gravity then
@@ -228,12 +228,12 @@ class Handlers:
 
     def set_tcp(self) -> None:
         """Set the TCP in the flange."""
-        self._target.tcp = self._script.pose()
+        self._target.tcp = self._program.pose()
 
     def set_gravity(self) -> None:
         """Set the direction of gravity."""
         # the script's vector points against the fall: (0, 0, 9.82) for an arm on the floor
-        x, y, z = self._script.vector(0)
+        x, y, z = self._program.vector(0)
         self._machine.gravity_m_s2 = (-x, -y, -z)
 
     def protective_stop(self) -> None:
@@ -242,31 +242,31 @@ class Handlers:
 
     def set_watchdog(self) -> None:
         """End the program where the command register is refreshed too seldom."""
-        frequency = self._script.double(0)
+        frequency = self._program.double(0)
         if not frequency > 0.0:
             raise ScriptError(f"rtde_set_watchdog: frequency {frequency:g}; accepted is above 0 Hz")
-        self._script.watchdog_s = 1.0 / frequency
+        self._program.watchdog_s = 1.0 / frequency
 
     def external_sensor(self) -> None:
         """Use the wrench that the client sends, or the built-in sensor again."""
-        script = self._script
-        if script.integer(1) == 1:
-            place_m = script.vector(1)
-            self._machine.external = ToolPayload(script.double(0), script.vector(4)), place_m
+        program = self._program
+        if program.integer(1) == 1:
+            place_m = program.vector(1)
+            self._machine.external = ToolPayload(program.double(0), program.vector(4)), place_m
         else:
             self._machine.external = None
 
 
-def commands(script: Program, machine: Machine) -> dict[int, Callable[[], Thread | None]]:
+def commands(program: Program, machine: Machine) -> dict[int, Callable[[], Thread | None]]:
     """What the client's program does, by the number of the command."""
-    does, target = Handlers(script, machine), machine.target
-    pose, doubles = script.pose, script.doubles
+    does, target = Handlers(program, machine), machine.target
+    pose, doubles = program.pose, program.doubles
 
     def one(answer: Callable[[], int]) -> Callable[[], None]:
-        return lambda: script.answer(answer())
+        return lambda: program.answer(answer())
 
     def many(answer: Callable[[], Iterable[float]]) -> Callable[[], None]:
-        return lambda: script.answer_doubles(answer())
+        return lambda: program.answer_doubles(answer())
 
     return {
         1: lambda: does.move(motion.movej, doubles(0)),
@@ -286,9 +286,9 @@ def commands(script: Program, machine: Machine) -> dict[int, Callable[[], Thread
         21: partial(does.set_force_mode, "gain_scaling", 2.0),
         # each pose is taken as the joint angles nearest to the actual ones
         24: lambda: does.servo(machine.solved(pose())),
-        25: one(lambda: machine.contact_steps(script.vector(0))),
+        25: one(lambda: machine.contact_steps(program.vector(0))),
         26: many(lambda: [CYCLE_S]),
-        27: many(lambda: machine.past_joints(script.integer(1))),
+        27: many(lambda: machine.past_joints(program.integer(1))),
         29: does.set_tcp,
         # exact, whatever error is allowed
         30: many(lambda: machine.solved(pose(), doubles(6))),

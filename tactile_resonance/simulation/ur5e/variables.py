@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from tactile_resonance.simulation.ur5e.controller import UrController
 
 # Numbers 0 to 23 are the lower range, 24 to 47 the upper one.
-REGISTER_COUNT = 48
+_REGISTER_COUNT = 48
 # Larger figures are refused: sums and squares of them would not be finite.
 LARGEST_FIGURE = 1e6
 
 # RTDE names of the inputs, by number.
-INT_INPUTS = tuple(f"input_int_register_{n}" for n in range(REGISTER_COUNT))
-DOUBLE_INPUTS = tuple(f"input_double_register_{n}" for n in range(REGISTER_COUNT))
+INT_INPUTS = tuple(f"input_int_register_{n}" for n in range(_REGISTER_COUNT))
+DOUBLE_INPUTS = tuple(f"input_double_register_{n}" for n in range(_REGISTER_COUNT))
 _REGISTERS = frozenset({*INT_INPUTS, *DOUBLE_INPUTS})
 
 # Groups of digital outputs and their first bit in the word of all.
@@ -71,8 +71,8 @@ class Registers:
     def __init__(self) -> None:
         self.inputs: dict[str, float] = dict.fromkeys(INT_INPUTS, 0)
         self.inputs.update(dict.fromkeys(DOUBLE_INPUTS, 0.0))
-        self.output_int = [0] * REGISTER_COUNT
-        self.output_double = [0.0] * REGISTER_COUNT
+        self.output_int = [0] * _REGISTER_COUNT
+        self.output_double = [0.0] * _REGISTER_COUNT
         self.refreshed: set[str] = set()
         self.digital_inputs = 0
         self.digital_outputs = 0
@@ -203,6 +203,6 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
         ("output_bit_registers0_to_31", "output_bit_registers32_to_63"),
         ("UINT32", lambda robot: 0),
     ),
-    **{f"output_int_register_{n}": ("INT32", _integer(n)) for n in range(REGISTER_COUNT)},
-    **{f"output_double_register_{n}": ("DOUBLE", _double(n)) for n in range(REGISTER_COUNT)},
+    **{f"output_int_register_{n}": ("INT32", _integer(n)) for n in range(_REGISTER_COUNT)},
+    **{f"output_double_register_{n}": ("DOUBLE", _double(n)) for n in range(_REGISTER_COUNT)},
 }

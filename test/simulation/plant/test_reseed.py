@@ -125,7 +125,7 @@ def test_the_present_reading_can_be_taken_as_zero_just_after_a_reseed():
     assert frames[0].data[5:7] == b"\x00\x00"
 
 
-def test_a_cell_is_reseeded_with_its_transducer():
+def test_a_cell_is_reseeded_while_it_streams():
     found = []
     for construction in (1, 2):
         cell = LoadCell(CELL, construction)
