@@ -89,9 +89,7 @@ def estimate_contact(
 
     >>> import numpy as np
     >>> import tactile_resonance as tr
-    >>> from tactile_resonance.calibration.model import CalibratedSensor
-    >>> from tactile_resonance.calibration.model import Calibration
-    >>> from tactile_resonance.calibration.model import SensorModel
+    >>> from tactile_resonance.calibration.model import CalibratedSensor, Calibration, SensorModel
     >>> model = SensorModel.of_values(
     ...     [236, 1540, 0.012, 0.012, 48.9, 170.7, 60.9, 46.4, 0.02, 3.5, 1.0, 0.0]
     ... )

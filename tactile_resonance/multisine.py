@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random-phase multisines: which lines, how large, with which phases."""
+"""Multisines: which lines, how large, with random phases; for linear work with small peaks, and more power."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def checked_harmonics(harmonics: npt.ArrayLike, samples_per_period: int) -> IntA
     last = (samples_per_period - 1) // 2
     if array[0] < 1 or array[-1] > last or np.any(np.diff(array) < 1):
         raise ValueError(
-            f"harmonics: {array.min()}..{array.max()}, expected ascending, within 1..{last}"
+            f"harmonics: {array[0]}..{array[-1]}, expected ascending, within 1..{last}"
         )
     array.flags.writeable = False
     return array
@@ -175,6 +175,8 @@ def harmonics_on_grid(
     """
     if grid is Grid.CUSTOM:
         raise ValueError("grid: custom has no rule; accepted are full, odd, odd_random")
+    if block_lines < 2:
+        raise ValueError(f"block_lines: {block_lines}, expected at least 2")
     lines = np.arange(low, high + 1, dtype=np.int64)
     if grid is not Grid.FULL:
         lines = lines[lines % 2 == 1]

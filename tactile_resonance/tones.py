@@ -99,9 +99,9 @@ def level_around(
 
 MOST_SAMPLES = 2**18
 """Of a piece; longer records are cut, and the powers of the pieces averaged."""
-FALSE_ALARM = 1e-4
+_FALSE_ALARM = 1e-4
 """Probability that noise of a channel makes a tone."""
-WINDOW = 33
+_WINDOW = 33
 DOF_OF_A_BIN = 1 / 4.2
 """Of a median of powers: 2.1 for the median, 2.0 bins that the window makes alike."""
 MAIN_LOBE = 4
@@ -190,7 +190,7 @@ def silent_record(
         kind = np.zeros(power.size, bool)
         first = max(int(np.ceil(edges[0] / resolution_hz)), FIRST_BIN)
         kind[first : int(edges[1] / resolution_hz) + 1] = True
-        level, around = level_around(power, kind, len(pieces), WINDOW)
+        level, around = level_around(power, kind, len(pieces), _WINDOW)
         if not around:
             raise ValueError(
                 f"band_hz: {edges[0]:g}..{edges[1]:g} Hz hold {kind.sum()} bins, expected 8 or more"
@@ -269,7 +269,7 @@ def _peaks(
     ratio = power[used] / np.maximum(level[used], np.finfo(float).tiny)
     chance[used] = special.fdtrc(2 * records, 2 * dof, ratio)
     found = []
-    for k in np.flatnonzero(chance * np.count_nonzero(kind) < FALSE_ALARM):
+    for k in np.flatnonzero(chance * np.count_nonzero(kind) < _FALSE_ALARM):
         near = power[k - MAIN_LOBE : k + MAIN_LOBE + 1]
         if near.size < 2 * MAIN_LOBE + 1 or power[k] < near.max():
             continue

@@ -31,8 +31,6 @@ BINS_PER_BAND = 8
 # Disturbances that the response explains somewhat are taken for the generator's, unless one gain for all
 # bins leaves so much less of the error.
 MUCH_MORE = 1.5
-# Mean square of the residuals over that of the data, below which they are rounding.
-ROUNDED = 1e-22
 
 
 class BinData(NamedTuple):

@@ -21,12 +21,13 @@ from numpy.polynomial import legendre
 from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.data import ROUNDED, BinData, rough_noise, with_noise
+from tactile_resonance.poles.data import BinData, rough_noise, with_noise
 from tactile_resonance.poles.fit import Linearised
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.modes import propagated
+from tactile_resonance.poles.noise_level import ROUNDED
 from tactile_resonance.poles.result import (
     Poles,
     PolesBatch,

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.poles.data import ROUNDED
 from tactile_resonance.poles.disturbances import poles_without_tones, with_transient_judged
 from tactile_resonance.poles.judgement import Judged, assemble, single
 from tactile_resonance.poles.lacking import FEWEST_OF_A_LINE, Lack
@@ -23,7 +22,7 @@ from tactile_resonance.poles.lines import (
     lines_of_spectra,
 )
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, are_smooth, systematic_of
-from tactile_resonance.poles.noise_level import KINDS, student_variance
+from tactile_resonance.poles.noise_level import KINDS, ROUNDED, student_variance
 from tactile_resonance.poles.result import Poles, PolesBatch
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
 

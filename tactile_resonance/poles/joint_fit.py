@@ -16,7 +16,7 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.estimate import Agreement
-from tactile_resonance.poles.data import ROUNDED, TINY, BinData, rules_between, with_noise
+from tactile_resonance.poles.data import BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
@@ -24,6 +24,8 @@ from tactile_resonance.poles.levels import Levels, Spread, level_of
 from tactile_resonance.poles.likelihood import Solution, moments
 from tactile_resonance.poles.model_error import are_smooth, systematic_of
 from tactile_resonance.poles.noise_level import (
+    ROUNDED,
+    TINY,
     Pieces,
     are_flat,
     line_pieces,

@@ -28,6 +28,8 @@ FEWEST_PIECE_DOF = 8
 # Pieces that are wanted before their degrees of freedom are.
 WANTED_PIECES = 5
 TINY = float(np.finfo(float).tiny)
+# Mean square of the residuals over that of the data, below which they are rounding.
+ROUNDED = 1e-22
 KINDS = ("flat", "sloped", "per line")
 
 
