@@ -135,8 +135,7 @@ def find_faults(
     -----
     What is looked for, per record: `CHECKS`. A channel skew needs a loop-back measurement
     (`skew.skew_from_loopback`); from an FRF it can only be suspected (`skew.suspected_skew`). A first period
-    that has not settled is none, and a slow drift spoils nothing, of an FRF by local polynomials: they take both
-    out.
+    that has not settled, and a slow drift, are no faults of an FRF by local polynomials, which take both out.
     """
     batch = record.samples.ndim - 3
     samples, bins, by_period = (

@@ -36,7 +36,7 @@ from tactile_resonance.scan.points import (
     tip_orientation,
 )
 from tactile_resonance.scan.run_content import RunContent
-from tactile_resonance.scan.scene import Output, ScanScene
+from tactile_resonance.scan.scene import Output, ScanScene, residual_terms_of
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest
 from tactile_resonance.sensor import MAX_LEVEL_V
 
@@ -281,6 +281,9 @@ def plan_rows(plan: Plan) -> list[tuple[str, str]]:
             "one to three modes, as the data choose" if band.order == 0 else f"order {band.order}"
         )
         of_data = "" if band.order == 0 else f" and {band.residual_terms} residual terms"
+        needed = min(residual_terms_of(band.ends_hz), 20)
+        if band.order and needed > band.residual_terms:
+            of_data += f" ({needed} follow a mode close beside the band, with less bias and less precision)"
         rows.append(("poles", f"{band.low_hz:g} to {band.high_hz:g} Hz, {order}{of_data}"))
     if Output.DISTORTION in scene.outputs:
         rows.append(("distortion", "even and odd, at input and output, in each band of poles"))

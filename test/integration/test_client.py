@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The example of the client's page, run as it stands there, on the bench with ideal contact."""
+"""The examples of the client's page, run as they stand there, on the bench with ideal contact."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,19 +12,16 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-from robot_at_hand import own_time
 from rosbags.highlevel import AnyReader
 
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 EXAMPLE = DOCS / "examples" / "scan_client.py"
-TIME = own_time(93)
-NODES = ("fake_hardware_node", "excitation_node", "frf_node", "poles_node", "scan_node")
+BENCH = DOCS / "examples" / "bench.py"
 SCENE = """
 name: a dish
 force_n: 0.01
@@ -40,20 +38,18 @@ def test_the_page_shows_the_example():
 
 def test_the_example_scans_its_poses_and_steers_the_scan(domain, tmp_path):
     (tmp_path / "dish.yaml").write_text(SCENE)
-    table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
-    bench = {"scene": tmp_path / "dish.yaml", "serve_contact": True, "table_in_base": table}
-    parameters = {
-        "fake_hardware_node": bench,
-        "excitation_node": {"record_folder": tmp_path / "records"},
-        "scan_node": {"table_in_base": table, "run_folder": tmp_path / "runs"},
-    }
-    for name in ("fake_hardware_node", "excitation_node", "scan_node"):
-        parameters[name]["time_server"] = TIME
-    with NodeProcesses(tmp_path / "log") as nodes:
-        nodes.bring_up(NODES, parameters)
+    files = (f"scene:={tmp_path / 'dish.yaml'}", f"run_folder:={tmp_path / 'runs'}")
+    home = {**os.environ, "ROS_HOME": str(tmp_path / "home")}
+    bench = subprocess.Popen(
+        [sys.executable, BENCH, "robot:=ideal", *files], cwd=tmp_path, env=home
+    )
+    try:
         answer = subprocess.run(
             [sys.executable, EXAMPLE], capture_output=True, text=True, timeout=600
         )
+    finally:
+        bench.terminate()  # all nodes with it
+        assert bench.wait(60) == 0
     assert answer.returncode == 0, answer.stderr
     *told, last = answer.stdout.splitlines()
     assert last == "cancelled: 3 of 6 points; cancelled"

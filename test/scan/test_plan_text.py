@@ -33,7 +33,10 @@ def test_a_plan_says_what_each_part_of_a_scene_leads_to():
     asked = scene(points=3)
     rows = told(asked)
     assert rows["touches"] == ["3: 3 points"]
-    assert rows["poles"] == ["200 to 300 Hz, order 2 and 6 residual terms"]
+    more = " (8 follow a mode close beside the band, with less bias and less precision)"
+    assert rows["poles"] == ["200 to 300 Hz, order 2 and 6 residual terms" + more]
+    enough = replace(asked, sensor=replace(asked.sensor, residual_terms=8))
+    assert told(enough)["poles"] == ["200 to 300 Hz, order 2 and 8 residual terms"]
     assert rows["drawn"] == ["report.html, pole_map.png, map.mcap"]
     assert any("distortion is not wanted" in text for text in rows["skipped"])
     bands = (PoleBand(600.0, 800.0, 0),)
