@@ -223,6 +223,8 @@ def _benchmark(options: argparse.Namespace) -> int:
         raise ValueError(f"--part: {options.part} is a table of `benchmark poles`")
     if options.row is not None and options.name != "faults":
         raise ValueError(f"--row: {options.row} is a row of `benchmark faults`")
+    if options.full and options.name not in (None, *WITH_FULL):
+        raise ValueError(f"--full: accepted of {', '.join(WITH_FULL)}")
     if options.guard:
         if options.name != "overview":
             raise ValueError("--guard: accepted is `benchmark overview --guard`")

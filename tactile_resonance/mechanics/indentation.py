@@ -188,6 +188,10 @@ def means_of(test: IndentationRecord) -> Means:
     got = f"{strong[: last + 1].max():.3g} N at most, {rest_n:.3g} N before the touch"
     accepted = "a largest one above 0 and above that in air: compression is positive"
     require(bool(peak > max(rest_n, 0.0)), "force_n", got, accepted)
+    held_n, count = float(force[reached : last + 1].mean()), last + 1 - reached
+    got = f"{held_n:.2g} N where it is deepest, {rest_n:.2g} N before, with a noise of {noise:.2g} N"
+    accepted = "a force above its noise: was the tissue touched, are forces in newtons?"
+    require(held_n - rest_n > SURE * noise / math.sqrt(count), "force_n", got, accepted)
     felt = int(np.argmax(strong >= PRESSED_FORCE * peak))
     ramp = max(first + 1, min(reached, felt, least, last))
     if test.protocol is not Protocol.INDENTATION:
@@ -232,6 +236,8 @@ MEDIAN_OF_SQUARE = 0.4549364
 """Of a normal variable with variance 1."""
 ALIKE = 20
 """Samples after which a filter's noise is new."""
+SURE = 5.0
+"""Deviations of its mean that the force rises by, at least, where tissue is touched."""
 LARGEST = 3.5
 """Deviations of the largest of some thousand normal variables."""
 

@@ -138,6 +138,15 @@ def test_what_is_no_contact_is_refused_by_field(change, message):
         fit_indentation(replace(test, **change(test)))
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_a_way_that_met_nothing_has_no_modulus(seed):
+    rng = np.random.default_rng(seed)
+    test = relaxation(STANDARD, rng, hold_s=3.0)
+    noise = 2e-4 * rng.standard_normal(test.time_s.size)
+    with pytest.raises(ValueError, match="force_n: got .*; accepted is"):
+        fit_indentation(replace(test, force_n=noise))
+
+
 def test_a_relaxation_without_a_hold_says_nothing_of_the_equilibrium():
     test = relaxation(STANDARD, np.random.default_rng(1), hold_s=3.0)
     short = test.time_s < 0.21
