@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo as a user starts it: a whole scan, through robot, load cell and all nodes."""
 
+import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -121,6 +123,37 @@ def start(folder, domain):
         assert time.monotonic() < deadline, processes_of(domain)
         time.sleep(0.1)
     return demo
+
+
+def test_a_run_that_is_complete_is_not_begun_again(demonstration, tmp_path, capsys):
+    from tactile_resonance import cli
+
+    run = tmp_path / "run"
+    shutil.copytree(demonstration.shown.run_folder, run)
+    assert cli.main(["resume", str(run)]) == 0
+    assert f"{run} is complete: nothing is left to measure" in capsys.readouterr().out
+    # no node was started: there is no folder for their logs
+    assert not run.with_name("run.work").exists()
+    assert [f.name for f in read_run(run).files] == [
+        f.name for f in read_run(demonstration.shown.run_folder).files
+    ]
+
+
+def test_a_resumed_run_keeps_the_seed_of_its_bench(demonstration, tmp_path):
+    from argparse import Namespace
+
+    from tactile_resonance.commands import bench_scan
+
+    run = tmp_path / "run"
+    shutil.copytree(demonstration.shown.run_folder, run)
+    for seed in (7, 42):
+        content = json.loads((run / "run.json").read_text())
+        content["facts"]["seed"] = seed
+        (run / "run.json").write_text(json.dumps(content))
+        options = Namespace(output=run, robot_host="127.0.2.9", real_time=False, calibration=None)
+        job = bench_scan._resumed_job(options)
+        parameters = bench_scan.node_parameters(job, classes=False, work=tmp_path)
+        assert parameters["fake_hardware_node"]["seed"] == seed
 
 
 def test_bad_options_are_refused_in_one_line(capsys):
