@@ -122,6 +122,11 @@ def test_a_sweep_rises_over_the_period_and_is_flat():
         design_multisine(**lines, sweep=True, realisations=2)
 
 
+def test_blocks_of_one_line_would_leave_all_lines_out():
+    with pytest.raises(ValueError, match="block_lines: 1, expected at least 2"):
+        harmonics_on_grid(1, 99, Grid.ODD_RANDOM, block_lines=1)
+
+
 def test_phases_are_uniform():
     """Mean of exp(j phi) over n phases has variance 1/n: here below 4.2 of its std (99.99 %)."""
     phases = np.concatenate([design_multisine(seed=s).phase_rad for s in range(20)])
@@ -147,6 +152,7 @@ def test_crest_factor_of_random_phases_is_near_four():
         ({"scale_by": "mean"}, "scale_by: 'mean'"),
         ({"relative_amplitude": np.ones(3)}, "relative_amplitude"),
         ({"grid": Grid.CUSTOM}, "grid: custom"),
+        ({"grid": Grid.ODD_RANDOM, "block_lines": 0}, "block_lines: got 0; accepted is a whole number"),
         ({"periods": 0}, "periods: got 0; accepted is a whole number"),
         ({"mains_hz": (50.0, 5.0)}, "mains_hz: 5, expected above 7.5 Hz"),
         ({"mains_hz": (float("nan"),)}, "mains_hz.0.: got nan; accepted is a finite number"),

@@ -10,6 +10,7 @@ from calibration.played import contact_of, run_on
 
 import tactile_resonance as tr
 from benchmarks.calibrate_benches import BAND_HZ, excitation
+from tactile_resonance.calibration.contact import Law
 from tactile_resonance.calibration.model import CalibratedSensor
 from tactile_resonance.cli import main
 from tactile_resonance.simulation.sensor.bimorph import couple
@@ -57,6 +58,11 @@ def test_one_period_needs_a_known_start(bench, library, sensor_file):
     recording = recording_on(bench, contact_of(bench, library["gel16"]), 0.02, 1)
     with pytest.raises(ValueError, match="periods: got 1; accepted is two periods or more, or from"):
         tr.estimate_contact(recording, sensor_file, band_hz=BAND_HZ)
+    known = {"band_hz": BAND_HZ, "from_rest": True}
+    with pytest.raises(ValueError, match="law: got 'Hooke'; accepted is one of .*power law"):
+        tr.estimate_contact(recording, sensor_file, **known, law="Hooke")
+    by_name = tr.estimate_contact(recording, sensor_file, **known, law="power law")
+    assert by_name.contact.prior.law is Law.POWER_LAW
 
 
 def test_a_contradicted_calibration_falls_back_and_says_so(bench, library, sensor_file):
