@@ -297,8 +297,8 @@ def _checked_frf(frf: FRF) -> FRF:
         if variance is None:
             continue
         values = _numbers(variance, f"frf.{name}", float)
-        if np.any(values < 0):
-            raise ValueError(f"frf.{name}: {np.nanmin(values):g}, expected none below 0")
+        if np.any(values < 0) and not np.any(values > 0):  # single lines are left out
+            raise ValueError(f"frf.{name}: {np.nanmin(values):g}, expected variances above 0")
         try:
             variances[name] = np.broadcast_to(values, g.shape)
         except ValueError:

@@ -49,7 +49,7 @@ def with_entry(row, column, value):
         ({"frequency_hz": LINES_HZ[:30]}, None, "frf.g: shape"),
         ({"frequency_hz": LINES_HZ[:, None]}, None, "frf.frequency_hz: shape"),
         ({"variance_noise": np.ones(30)}, None, "frf.variance_noise: shape"),
-        ({"variance_noise": -1e-6}, None, "frf.variance_noise: -1e-06, expected none below 0"),
+        ({"variance_noise": -1e-6}, None, "frf.variance_noise: -1e-06, expected variances above 0"),
         ({"variance_noise": 1e-6j}, None, "frf.variance_noise: got .*; accepted is an array of real numbers"),
         ({"noise_dof": -1}, None, "frf.noise_dof: got -1"),
         ({}, (300, 200), "band_hz: "),
