@@ -38,6 +38,12 @@ sys.exit(main(sys.argv[1:]))
     )
 
 
+def test_a_larger_grid_is_refused_where_there_is_none(tmp_path, capsys):
+    assert cli.main(["benchmark", "frf", "--full", "--output", str(tmp_path / "out")]) == 1
+    assert "--full: accepted of contact, hostile" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_compiling_is_announced_once_and_before_it_begins():
     """A cheap function in place of the kernels, compiled twice; what the cache holds is not announced."""
     code = """
