@@ -157,7 +157,8 @@ def read_file(kind: type[T], path: Path) -> T:
 
 def section(mapping: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
     """Return the sub-mapping `key`; ``ValueError`` if it is absent or no mapping."""
-    return _mapping(mapping.get(key), join(where, key))
+    require(key in mapping, join(where, key), None, "a mapping (it is missing)")
+    return _mapping(mapping[key], join(where, key))
 
 
 def known_keys(mapping: Mapping[str, Any], keys: set[str], where: str) -> None:

@@ -174,6 +174,34 @@ def _press(c, bending, time, depth, turn, einf, moduli, times, force, delta):
             delta[p, n] = now
 
 
+def sphere_share(ball: BallTip, depth_m: float) -> float:
+    """Force of a sphere over that of Hertz's paraboloid at a depth (Sneddon 1965), 1 for small ones.
+
+    NaN where the sphere is in to its equator.
+    """
+
+    def depth_of(x: float) -> float:  # over R, of a contact radius x R
+        return x / 2 * np.log((1 + x) / (1 - x))
+
+    wanted = depth_m / ball.radius_m
+    if not wanted < 1.0:
+        return np.nan
+    if wanted < 1e-9:
+        return 1.0
+    x = brentq(lambda x: depth_of(x) - wanted, 0.0, 1 - 1e-12)
+    force = (x * x + 1) / 2 * np.log((1 + x) / (1 - x)) - x
+    return float(force / (4 / 3 * wanted**1.5))
+
+
+def layer_share(ball: BallTip, depth_m: float, thickness_m: float) -> float:
+    """Force on a layer bonded to what is rigid over that of a half-space, ``nu`` 0.5.
+
+    Dimitriadis et al., Biophys. J. 82 (2002) 2798, equation 11.
+    """
+    x = np.sqrt(ball.radius_m * depth_m) / thickness_m
+    return float(1 + x * (1.133 + x * (1.283 + x * (0.769 + x * 0.0975))))
+
+
 @dataclass(frozen=True)
 class SeriesSolution:
     """Logarithms of constants, surface, zero and its drift that fit best."""
@@ -373,31 +401,3 @@ def _nodes(means: Means) -> tuple[FloatArray, FloatArray, IntArray]:
     at = np.concatenate([[0], np.cumsum(parts)])
     dense = np.interp(np.arange(at[-1] + 1), at, time)
     return dense, np.interp(dense, time, depth), at
-
-
-def sphere_share(ball: BallTip, depth_m: float) -> float:
-    """Force of a sphere over that of Hertz's paraboloid at a depth (Sneddon 1965), 1 for small ones.
-
-    NaN where the sphere is in to its equator.
-    """
-
-    def depth_of(x: float) -> float:  # over R, of a contact radius x R
-        return x / 2 * np.log((1 + x) / (1 - x))
-
-    wanted = depth_m / ball.radius_m
-    if not wanted < 1.0:
-        return np.nan
-    if wanted < 1e-9:
-        return 1.0
-    x = brentq(lambda x: depth_of(x) - wanted, 0.0, 1 - 1e-12)
-    force = (x * x + 1) / 2 * np.log((1 + x) / (1 - x)) - x
-    return float(force / (4 / 3 * wanted**1.5))
-
-
-def layer_share(ball: BallTip, depth_m: float, thickness_m: float) -> float:
-    """Force on a layer bonded to what is rigid over that of a half-space, ``nu`` 0.5.
-
-    Dimitriadis et al., Biophys. J. 82 (2002) 2798, equation 11.
-    """
-    x = np.sqrt(ball.radius_m * depth_m) / thickness_m
-    return float(1 + x * (1.133 + x * (1.283 + x * (0.769 + x * 0.0975))))

@@ -186,7 +186,8 @@ def read_positions(fields: Mapping[str, Any], where: str) -> FloatArray:
     ValueError
         If it is none of the known patterns, or a field of it is wrong.
     """
-    form, pattern = one_of(_FORMS, fields, where, frozenset({"adaptive"}))
+    require(len(fields) == 1, where, [*fields], f"exactly one of {', '.join((*_FORMS, 'adaptive'))}")
+    form, pattern = one_of(_FORMS, fields, where)
     positions = pattern if form == "list" else build(pattern.positions, f"{where}.{form}")
     require_near(positions, where)
     return positions

@@ -88,7 +88,7 @@ def test_region_keeps_the_grid_points_in_it():
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({}, "exactly one of"),
+        ({}, "exactly one of .*adaptive"),
         ({"grid": {"center_m": [0, 0], "size_m": [1, 1]}}, "grid.spacing_m: got None"),
         ({"grid": {"center_m": [0], "size_m": [1, 1], "spacing_m": 1}}, "grid.center_m"),
         ({"grid": {"center_m": [0, 0], "size_m": [1, 1], "spacing_m": 1e-5}}, "at most 100000"),
