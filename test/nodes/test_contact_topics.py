@@ -225,7 +225,7 @@ def poles(pole, middle_ns, *, final=True, covariance=True):
 
 
 class Hearing:
-    """A `TouchFromPoles` with a clock that is told."""
+    """A `TouchFromPoles` with a clock set by the test."""
 
     def __init__(self, references=3):
         self.told, self.now_ns = 0, UP_NS + 2 * SECOND_NS

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goals whose answers are late or lost, on a clock that is told: none is left of which nobody knows."""
+"""Goals whose answers are late or lost, on a clock set by the test: each is followed or cancelled."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, Quaternion, WrenchStamped
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from spinning import spin_until
@@ -170,14 +170,14 @@ def ideal(monkeypatch):
         yield made
 
 
-def goal_at(x_m=0.0, y_m=0.0, z_m=0.0, force_n=FORCE_N):
+def goal_at(x_m=0.0, y_m=0.0, z_m=0.0, force_n=FORCE_N, turn=(0.0, 0.0, 0.0, 1.0)):
     """On the first dish of the scene, in the base."""
     goal = MakeContact.Goal(force_n=force_n)
     goal.pose.header.frame_id = "base"
     place = goal.pose.pose.position
     # the table is turned by -90 degrees about z
     place.x, place.y, place.z = (np.array(TABLE_IN_BASE[:3]) + [y_m, -x_m, z_m]).tolist()
-    goal.pose.pose.orientation.w = 1.0
+    goal.pose.pose.orientation = Quaternion(**dict(zip("xyzw", turn, strict=True)))
     return goal
 
 
@@ -225,6 +225,7 @@ def test_a_contact_is_made_held_told_and_drawn_back(ideal):
         ({"force_n": math.nan}, "refused", "force_n: got nan"),
         ({"force_n": 0.5}, "refused", "force_n: got 0.5; accepted is up to 0.02, two thirds of"),
         ({"z_m": 2.0}, "refused", "touch: its standoff"),
+        ({"turn": (1.0, 0.0, 0.0, 0.0)}, "refused", "touch: tilted by more than"),
         ({"x_m": 0.03}, "surface_missing", "nothing to touch there"),
     ],
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether nodes are at work: judged on a clock that is told, and through the real graph."""
+"""Whether nodes are at work: judged on a clock set by the test, and through the real graph."""
 
 import os
 from functools import partial

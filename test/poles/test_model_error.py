@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model that leaves something out is told, one that does not is left in peace; smooth residuals."""
+"""Models that leave something out are detected, complete ones are not called wrong; smooth residuals."""
 
 import numpy as np
 import pytest
