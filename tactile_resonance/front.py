@@ -16,7 +16,7 @@ from tactile_resonance.analysis import analyse
 from tactile_resonance.fields import require_kind, whole
 from tactile_resonance.frf.estimate import frf_of_record, with_narrow_modes_judged
 from tactile_resonance.frf.excited import find_excited_harmonics
-from tactile_resonance.frf.result import FRF
+from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import Poles, PolesStatus
@@ -237,5 +237,7 @@ def identify_poles(
         return poles
     analysis = analyse(data, band_hz=band_hz, structure=structure)
     of_record = analysis.faults.message if analysis.faults.suspect else ""
+    if analysis.poles.status is not PolesStatus.OK and analysis.frf.status is FrfStatus.SUSPECT:
+        of_record = analysis.frf.message  # these faults, and whether lines were driven at all
     message = "; ".join(filter(None, [of_record, analysis.poles.message]))
     return replace(analysis.poles, message=message)

@@ -2,8 +2,10 @@
 """The package as a library: `import tactile_resonance as tr`."""
 
 import doctest
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -178,6 +180,19 @@ def test_a_fault_of_the_record_is_in_the_message_of_its_poles(recording):
     y[..., -1, 500:560] = y[..., -1, 499, None]
     held = tr.make_recording(recording.u, y, sample_rate_hz=recording.sample_rate_hz)
     assert "The sensor stands still for 61 samples" in tr.identify_poles(held, (200, 300)).message
+
+
+def test_lines_that_were_not_driven_are_in_the_message_of_poles_that_are_none(recording):
+    rng = np.random.default_rng(1)
+    u = 1e-5 * rng.standard_normal(recording.u.shape)  # the generator was off
+    y = 1e-3 * rng.standard_normal(recording.y.shape)
+    off = replace(recording, u=u, y=y)
+    assert off.excited_harmonics is not None  # the lines are stated, not found
+    poles = tr.identify_poles(off, (200, 300))
+    assert poles.status is not tr.PolesStatus.OK
+    weak = re.search(r"input less than 10 dB above its noise at (\d+) of 41 lines", poles.message)
+    # noise is ten times its own variance, of two degrees of freedom or more, on 3 % of lines at most
+    assert weak and int(weak[1]) > 30
 
 
 def test_a_band_without_lines_is_refused_for_recording_and_response_alike(recording):
