@@ -86,8 +86,8 @@ class LiveClient(ScanClient):
     def press(self) -> bool:
         """Make a contact at the table's origin; whether it is held."""
         try:
-            handle = self._contact.send(_goal(), self._check, lambda: None)
-            return bool(self._contact.follow(handle, self._check, lambda: None).reached)
+            handle = self._contact.send(_goal(), self._check)
+            return bool(self._contact.follow(handle, self._check).reached)
         except NodeAway:  # it has lost the robot or the cell, and is made anew
             return False
 

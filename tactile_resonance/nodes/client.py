@@ -109,7 +109,7 @@ class NodeClient(ABC):
         """Send a goal until it is accepted; one whose answer may be lost is sent again under its id."""
         goals = Goals(client, type(goal).__qualname__, self.spin)
         try:
-            return goals.send(goal, self._check, lambda: None, feedback)
+            return goals.send(goal, self._check, feedback)
         except (NodeAway, ScanEnded) as error:
             raise NoAnswer(str(error)) from error
 

@@ -75,8 +75,6 @@ GONE_S = 10.0
 GOAL_ENDS_WITHIN_S = 15.0
 REFUSED_AGAIN_S = 0.05
 
-Poll = Callable[[], None]
-"""Called while waiting; raises where what is waited for cannot come."""
 Steps = Generator[None, None, Any]
 
 
@@ -102,7 +100,6 @@ class Goals:
         self,
         goal: Any,
         check: Check,
-        poll: Poll,
         feedback: Callable[[Any], None] | None = None,
         refused: Callable[[], None] = lambda: None,
     ) -> ClientGoalHandle:
@@ -128,18 +125,18 @@ class Goals:
             check()
             if self.client.server_is_ready():
                 with contextlib.closing(offer(self.client, goal, hear)) as steps:
-                    handle = self._wait(steps, lambda: self._require_node(check, poll), deadline_s)
+                    handle = self._wait(steps, lambda: self._require_node(check), deadline_s)
                 if handle is not None:
                     return handle
                 refused()
             self.pause(REFUSED_AGAIN_S)
         raise ScanEnded(f"{self.name}: no node takes the goal for {TAKEN_WITHIN_S:g} s")
 
-    def follow(self, handle: ClientGoalHandle, check: Check, poll: Poll) -> Any:
+    def follow(self, handle: ClientGoalHandle, check: Check) -> Any:
         """Result of a goal; where anything is raised the goal is cancelled first, and its end waited for."""
         steps = answer_to(self.client, handle, lambda: self._heard_s)
         try:
-            answer = self._wait(steps, lambda: self._require_node(check, poll))
+            answer = self._wait(steps, lambda: self._require_node(check))
             if answer is None:
                 raise NodeAway(f"{self.name}: its node does not know the goal", "node went away")
         except (PointFailed, Interrupted, ScanEnded):
@@ -162,10 +159,9 @@ class Goals:
             self.pause(POLL_S)
         return None
 
-    def _require_node(self, check: Check, poll: Poll) -> None:
+    def _require_node(self, check: Check) -> None:
         if not self.client.server_is_ready():
             raise NodeAway(f"{self.name}: its node went away", "node went away")
-        poll()
         check()
 
 

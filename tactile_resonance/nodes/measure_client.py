@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
 from tactile_resonance.frf.result import BandDistortion
-from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll
+from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import NO_RECORDS, each_to_message
 from tactile_resonance.nodes.node_watch import ScanTime
@@ -69,13 +69,11 @@ class MeasureClient:
         enough: Callable[[msg.Poles, int], bool],
         recording: PointRecording,
         check: Check,
-        poll: Poll,
-        held: Callable[[], None],
+        held: Check,
     ) -> msg.Poles | None:
         """The last poles of a measurement all of whose messages are in the recording; None where none came.
 
-        `poll` is called while waiting, and raises where what is waited for cannot come; `held` while it is
-        measured, and raises where the contact was lost.
+        `check` is called while waiting; `held` while it is measured, and raises where the contact was lost.
         """
         # its own id: another measurement may be under way, begun by a scan that was killed
         recording.measurement_id = time.time_ns() // 1000
@@ -96,15 +94,14 @@ class MeasureClient:
             bands=each_to_message(msg.Band, design.bands),
         )
         with self.recorder.recording(recording, goal.measurement_id):
-            return self._follow(goal, enough, check, poll, held)
+            return self._follow(goal, enough, check, held)
 
     def _follow(
         self,
         goal: Measure.Goal,
         enough: Callable[[msg.Poles, int], bool],
         check: Check,
-        poll: Poll,
-        held: Callable[[], None],
+        held: Check,
     ) -> msg.Poles | None:
         seen: list[msg.Poles] = []
         stopping = False
@@ -126,7 +123,7 @@ class MeasureClient:
 
         def each_poll() -> None:
             take_poles()
-            poll()
+            check()
             held()
             if self._time.simulated and time.monotonic() - news_s > self._time.silent_s:
                 raise PointDisturbed("no poles of a block came", "messages lost")
@@ -136,8 +133,8 @@ class MeasureClient:
             # once before the measurement and once after each block: every block that is handed over ends it
             self._time.go()
             # refused while somebody else measures, whose blocks end a go too
-            handle = self._goals.send(goal, check, poll, refused=self._time.go)
-            result = self._goals.follow(handle, check, each_poll)
+            handle = self._goals.send(goal, check, refused=self._time.go)
+            result = self._goals.follow(handle, each_poll)
             if result.outcome != Measure.Result.NOT_READY or time.monotonic() > deadline:
                 break
             time.sleep(NOT_READY_POLL_S)
@@ -145,21 +142,20 @@ class MeasureClient:
             raise ScanEnded(f"measurement: {result.message}; the run can be resumed")
         if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
             raise PointDisturbed(f"measurement: {result.message}", "measurement failed")
-        self._wait_for_results(result, check, poll)
+        self._wait_for_results(result, check)
         take_poles()
         return seen[-1] if seen else None
 
-    def _wait_for_results(self, result: Measure.Result, check: Check, poll: Poll) -> None:
+    def _wait_for_results(self, result: Measure.Result, check: Check) -> None:
         """Until every block's record, FRF and poles are in the recording, and all excitations."""
         deadline = time.monotonic() + self._time.patience_s(RESULTS_WITHIN_S)
         while missing := self.recorder.missing(result.blocks):
             if time.monotonic() > deadline:
                 raise PointDisturbed(missing, "messages lost")
             try:
-                poll()
+                check()
             except NodeAway as error:
                 raise NodeAway(f"{error}; {missing}", error.kind) from error
-            check()
             time.sleep(POLL_S)
 
 

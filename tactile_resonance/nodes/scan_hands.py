@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
@@ -20,11 +20,11 @@ from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.nodes.goals import POLL_S, Poll, answer_of
+from tactile_resonance.nodes.goals import POLL_S, answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.measure_client import MeasureClient
 from tactile_resonance.nodes.messages import pose_to_message
-from tactile_resonance.nodes.node_watch import Instances, NodeWatch, ScanTime
+from tactile_resonance.nodes.node_watch import NodeWatch, ScanTime
 from tactile_resonance.nodes.parameters import values
 from tactile_resonance.nodes.running import PLACES
 from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
@@ -33,6 +33,7 @@ from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.clearance import STILL_M, Standoffs, TipUse
 from tactile_resonance.scan.hands import (
     Check,
+    Disturbances,
     Measured,
     NodeAway,
     PointDisturbed,
@@ -156,24 +157,36 @@ class NodeHands:
         if self._tip is None:
             self._place(pose, check)
             return
-        poll = self._poll_of([STATE_TOPIC])
         lowest_m = self.standoffs.lowest_m(point)
+        check = self._check_of([STATE_TOPIC], check)
         with self._nodes.doubted_after(NodeAway):
             try:
-                made = self._tip.hold(pose, force_n, hold, check, poll, lowest_m)
+                made = self._tip.hold(pose, force_n, hold, check, lowest_m)
             except SurfaceEarly:
                 if math.isinf(lowest_m):
                     raise
                 self.standoffs.forget()
-                made = self._tip.hold(pose, force_n, hold, check, poll)
+                made = self._tip.hold(pose, force_n, hold, check)
         self.standoffs.add(point, made.surface_m, made.surface_std_m)
 
     def find(self, point: ScanPoint, force_n: float, ball_radius_m: float, check: Check) -> Touch:
-        """Touch a point of the surface as it is expected and draw back; return where the ball met it."""
+        """Touch a point of the surface as it is expected and draw back; return where the ball met it.
+
+        A touch that is disturbed is repeated, once the tip is not stopped.
+        """
         if self._tip is None:
             raise ScanEnded(NOT_MOVED)
-        poll = self._poll_of([STATE_TOPIC])
-        result = self._tip.touch(self._pose_of(point), force_n, check, poll)
+        pose, disturbed, result = self._pose_of(point), Disturbances(), None
+        while result is None:
+            while self._tip.stopped:
+                check()
+                time.sleep(POLL_S)
+            try:
+                # anew each time: a node that was restarted is another one
+                result = self._tip.touch(pose, force_n, self._check_of([STATE_TOPIC], check))
+            except PointDisturbed as error:
+                if not disturbed.again(error):
+                    raise
         way = np.array(point.normal) * (ball_radius_m + result.surface_m)
         x, y, z = (point.position_m + way).tolist()
         return Touch((x, y, z), max(result.surface_std_m, LEAST_TOUCH_STD_M), result.force_n)
@@ -195,16 +208,15 @@ class NodeHands:
         def enough_of(message: msg.Poles, blocks: int) -> bool:
             return enough(self._measured(message), blocks)
 
+        held = (lambda: None) if self._tip is None else self._tip.check
+        topics = (*STREAM_TOPICS, *([STATE_TOPIC] if touching else []))
         with self._nodes.doubted_after(NodeAway):
             if self._is_stopped():
                 raise Stopped
             if missing := self.missing():
                 raise NodeAway(missing, "node away")
-            poll = self._poll_of([*STREAM_TOPICS, *([STATE_TOPIC] if touching else [])])
-            held = (lambda: None) if self._tip is None else self._tip.check
-            last = self._measure.measure(
-                design, label, seed, enough_of, recording, check, poll, held
-            )
+            check = self._check_of(topics, check)
+            last = self._measure.measure(design, label, seed, enough_of, recording, check, held)
         if last is None:
             raise PointFailed("measurement: it ended before its first block")
         measured = self._measured(last)
@@ -250,9 +262,9 @@ class NodeHands:
         """Carry a mechanical test out by contact_node; what it recorded is kept, whatever becomes of it."""
         if self._tip is None:
             raise ScanEnded(NOT_MOVED)
-        poll = self._poll_of([STATE_TOPIC])
+        check = self._check_of([STATE_TOPIC], check)
         with self._nodes.doubted_after(NodeAway):
-            result = self._tip.test(self._pose_of(point), asked, force_n, check, poll)
+            result = self._tip.test(self._pose_of(point), asked, force_n, check)
         record = result.record
         if record.time_s:
             topic = self._node.resolve_topic_name(TOPIC)
@@ -283,11 +295,11 @@ class NodeHands:
         age_s = math.nan if touched_ns is None else (origin.time_ns - touched_ns) * 1e-9
         return Measured(poles, origin, age_s, self._measure.recorder.distortion)
 
-    def _poll_of(self, topics: list[str]) -> Poll:
-        """Raises `NodeAway` where a node behind these topics is not at work any more."""
-        instances: Instances = self._nodes.instances(topics)
+    def _check_of(self, topics: Sequence[str], check: Check) -> Check:
+        """The same, which also raises `NodeAway` where a node behind these topics is not at work any more."""
+        instances = self._nodes.instances(topics)
 
-        def poll() -> None:
+        def both() -> None:
             waited_for = self._nodes.waited_for(instances)
             who = waited_for.partition(",")[0]
             if who != self._waited_for:
@@ -299,8 +311,9 @@ class NodeHands:
             problem = self._nodes.changed(instances)
             if problem is not None:
                 raise NodeAway(problem, "node away")
+            check()
 
-        return poll
+        return both
 
     def _end_if_hung(self) -> None:
         """In simulated time a node that hangs holds time up; the scan ends where that lasts too long."""

@@ -15,7 +15,7 @@ from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, Poll, answer_of
+from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, answer_of
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import HOLDS
 from tactile_resonance.nodes.node_watch import ScanTime
@@ -24,7 +24,6 @@ from tactile_resonance.recording.messages import PROTOCOLS, time_from_message
 from tactile_resonance.scan.hands import (
     NODE_BACK_WITHIN_S,
     Check,
-    Disturbances,
     PointDisturbed,
     PointFailed,
     ScanEnded,
@@ -115,7 +114,6 @@ class TipContact:
         force_n: float,
         hold: HoldMode,
         check: Check,
-        poll: Poll,
         standoff_m: float = math.inf,
     ) -> MakeContact.Result:
         """Press there until the force is held, from a standoff that is no higher than the usual one."""
@@ -123,9 +121,8 @@ class TipContact:
         self._low = math.isfinite(standoff_m)
         goal.standoff_m = standoff_m if self._low else 0.0
         goal.hold = HOLDS[hold]
-        result, poll = self._make(goal, check, poll), self._going(poll)
+        result, check = self._make(goal, check), self._going(check)
         while (state := self._state).state != state.STATE_HOLD:
-            poll()
             check()
             if state.cause not in ("", Cause.NONE.value):
                 raise self.failure(state)
@@ -133,29 +130,19 @@ class TipContact:
         self.touched_ns = self._held_ns - round(result.contact_s * 1e9)
         return result
 
-    def touch(
-        self, pose: PoseStamped, force_n: float, check: Check, poll: Poll
-    ) -> MakeContact.Result:
-        """Touch and draw back; a touch that is disturbed is repeated, once the tip is not stopped."""
-        disturbed = Disturbances()
-        while True:
-            while self.stopped:
-                check()
-                time.sleep(POLL_S)
-            try:
-                return self._make(MakeContact.Goal(pose=pose, force_n=force_n), check, poll)
-            except PointDisturbed as error:
-                if not disturbed.again(error):
-                    raise
-            finally:
-                self.retract(TOUCH_RETRACT_WITHIN_S)
+    def touch(self, pose: PoseStamped, force_n: float, check: Check) -> MakeContact.Result:
+        """Touch and draw back."""
+        try:
+            return self._make(MakeContact.Goal(pose=pose, force_n=force_n), check)
+        finally:
+            self.retract(TOUCH_RETRACT_WITHIN_S)
 
     def offers_tests(self) -> bool:
         """Whether a node offers the action `indent`: ideal contact does not."""
         return self._tests.client.wait_for_server(self._time.patience_s(OFFERED_WITHIN_S))
 
     def test(
-        self, pose: PoseStamped, asked: ProtocolRequest, force_n: float, check: Check, poll: Poll
+        self, pose: PoseStamped, asked: ProtocolRequest, force_n: float, check: Check
     ) -> Indent.Result:
         """Carry a mechanical test out, and leave the tip free."""
         goal = Indent.Goal(
@@ -167,7 +154,7 @@ class TipContact:
             unload_speed_m_s=asked.unload_speed_m_s or 0.0,
         )
         try:
-            return self._sent(self._tests, goal, check, poll)
+            return self._sent(self._tests, goal, check)
         finally:
             self.retract()
 
@@ -212,16 +199,14 @@ class TipContact:
         if self.touching and state.state not in (UNKNOWN.state, state.STATE_HOLD):
             raise self.failure(state)
 
-    def _make(self, goal: MakeContact.Goal, check: Check, poll: Poll) -> MakeContact.Result:
+    def _make(self, goal: MakeContact.Goal, check: Check) -> MakeContact.Result:
         """Contact that was reached; `PointFailed` or `PointDisturbed` where it was not."""
-        result = self._sent(self._goals, goal, check, poll)
+        result = self._sent(self._goals, goal, check)
         if not result.reached:
             raise self.failure(result)
         return result
 
-    def _sent(
-        self, goals: Goals, goal: MakeContact.Goal | Indent.Goal, check: Check, poll: Poll
-    ) -> Any:
+    def _sent(self, goals: Goals, goal: MakeContact.Goal | Indent.Goal, check: Check) -> Any:
         """Result of a goal, from a tip that is free."""
         # a contact that a scan before this one left is ended first
         state = self._state
@@ -231,14 +216,14 @@ class TipContact:
         self._state = UNKNOWN
         self._times.begin()
         self._time.go()
-        poll = self._going(poll)
-        return goals.follow(goals.send(goal, check, poll), check, poll)
+        check = self._going(check)
+        return goals.follow(goals.send(goal, check), check)
 
-    def _going(self, poll: Poll) -> Poll:
+    def _going(self, check: Check) -> Check:
         """The same, and time goes on."""
 
         def both() -> None:
-            poll()
+            check()
             self._time.keep_going()
 
         return both

@@ -125,9 +125,9 @@ def test_a_goal_that_is_left_is_cancelled_at_its_server(client):
     def check():
         raise Interrupted("enough")
 
-    handle = goals.send(Measure.Goal(), lambda: None, lambda: None)
+    handle = goals.send(Measure.Goal(), lambda: None)
     with pytest.raises(Interrupted):
-        goals.follow(handle, check, lambda: None)
+        goals.follow(handle, check)
     result = handle.get_result_async()
     assert comes(result)
     assert result.result().result.message == "cancelled"

@@ -33,7 +33,7 @@ class Late:
 
 
 def nothing():
-    """Neither poll nor check has anything to say."""
+    """Has nothing to say while something is waited for."""
 
 
 class Node:
@@ -157,11 +157,11 @@ def ended_by(node, error, after_s):
 
 def test_a_goal_is_asked_for_once_and_followed_to_its_end(taken):
     node, goals = taken()
-    handle = goals.send("goal", nothing, nothing)
+    handle = goals.send("goal", nothing)
     assert handle.accepted
     (goal_id,) = node.asked
     node.end(goal_id)
-    assert goals.follow(handle, nothing, nothing) == GoalStatus.STATUS_SUCCEEDED
+    assert goals.follow(handle, nothing) == GoalStatus.STATUS_SUCCEEDED
     assert node.cancelled == []
 
 
@@ -172,30 +172,30 @@ def test_a_late_or_lost_answer_is_asked_for_under_the_same_id_and_the_goal_is_ta
     taken, answers
 ):
     node, goals = taken(answers)
-    handle = goals.send("goal", nothing, nothing)
+    handle = goals.send("goal", nothing)
     assert node.now_s > ASK_AGAIN_S
     assert len(node.asked) > 1
     assert len(set(node.asked)) == 1
     assert node.running == [bytes(handle.goal_id.uuid)]
     node.end(node.asked[0])
     # it is the goal that is followed, whatever its second question was answered
-    assert goals.follow(handle, nothing, nothing) == GoalStatus.STATUS_SUCCEEDED
+    assert goals.follow(handle, nothing) == GoalStatus.STATUS_SUCCEEDED
     assert node.cancelled == []
 
 
 def test_a_result_that_is_lost_is_requested_again(taken):
     node, goals = taken()
-    handle = goals.send("goal", nothing, nothing)
+    handle = goals.send("goal", nothing)
     node.lost_results = 2
     node.end(node.asked[0])
-    assert goals.follow(handle, nothing, nothing) == GoalStatus.STATUS_SUCCEEDED
+    assert goals.follow(handle, nothing) == GoalStatus.STATUS_SUCCEEDED
     assert node.now_s == pytest.approx(2 * goals_module.SILENT_S, abs=0.1)
 
 
 def test_a_result_is_requested_once_while_feedback_comes(taken):
     node, goals = taken()
     heard = []
-    handle = goals.send("goal", nothing, nothing, heard.append)
+    handle = goals.send("goal", nothing, heard.append)
     end_s = node.now_s + 4 * goals_module.SILENT_S
 
     def poll():
@@ -203,21 +203,21 @@ def test_a_result_is_requested_once_while_feedback_comes(taken):
         if node.now_s > end_s and node.running:
             node.end(node.asked[0])
 
-    assert goals.follow(handle, nothing, poll) == GoalStatus.STATUS_SUCCEEDED
+    assert goals.follow(handle, poll) == GoalStatus.STATUS_SUCCEEDED
     assert node.requested == 1
     assert set(heard) == {"so far"}
 
 
 def test_a_goal_that_is_refused_is_asked_for_again_as_another(taken):
     node, goals = taken({0: REFUSED, 1: REFUSED})
-    handle = goals.send("goal", nothing, nothing)
+    handle = goals.send("goal", nothing)
     assert len(set(node.asked)) == 3
     assert node.running == [bytes(handle.goal_id.uuid)] == node.asked[-1:]
 
 
 def test_a_question_that_comes_after_the_same_was_refused_leaves_no_goal_behind(taken):
     node, goals = taken({0: Late(10.0), 1: REFUSED})
-    handle = goals.send("goal", nothing, nothing)
+    handle = goals.send("goal", nothing)
     assert node.running == [bytes(handle.goal_id.uuid)]
     assert node.running[0] != node.asked[0]
     node.pause(20.0)
@@ -232,7 +232,7 @@ def test_a_question_that_comes_after_the_same_was_refused_leaves_no_goal_behind(
 def test_a_goal_that_is_given_up_before_its_answer_came_does_not_go_on(taken, answers, error):
     node, goals = taken(answers)
     with pytest.raises(type(error)):
-        goals.send("goal", ended_by(node, error, 0.5), nothing)
+        goals.send("goal", ended_by(node, error, 0.5))
     node.pause(10.0)  # what is late comes now
     assert node.running == []
     assert set(node.cancelled) == set(node.asked)
@@ -245,7 +245,7 @@ def test_a_goal_whose_node_goes_away_before_it_answers_is_cancelled_where_it_was
         node.up = node.now_s < 1.0
 
     with pytest.raises(NodeAway, match="measure: its node went away"):
-        goals.send("goal", nothing, poll)
+        goals.send("goal", poll)
     node.pause(10.0)
     assert node.running == []
 
@@ -254,7 +254,7 @@ def test_a_goal_whose_node_goes_away_before_it_answers_is_cancelled_where_it_was
 def test_a_goal_that_nobody_takes_ends_the_scan(taken, answer):
     node, goals = taken(dict.fromkeys(range(10000), answer))
     with pytest.raises(ScanEnded, match="measure: no node takes the goal for 60 s"):
-        goals.send("goal", nothing, nothing)
+        goals.send("goal", nothing)
     assert node.now_s == pytest.approx(TAKEN_WITHIN_S, abs=0.1)
     assert node.running == []
 
@@ -263,7 +263,7 @@ def test_no_goal_is_sent_while_its_node_is_away(taken):
     node, goals = taken()
     node.up = False
     with pytest.raises(ScanEnded):
-        goals.send("goal", nothing, nothing)
+        goals.send("goal", nothing)
     assert node.asked == []
 
 
@@ -271,9 +271,9 @@ def test_no_goal_is_sent_while_its_node_is_away(taken):
 def test_a_goal_that_is_left_is_cancelled_and_waited_for(taken, error):
     node, goals = taken()
     node.ends_after_s = 3.0  # with its block
-    handle = goals.send("goal", nothing, nothing)
+    handle = goals.send("goal", nothing)
     with pytest.raises(type(error)):
-        goals.follow(handle, ended_by(node, error, node.now_s + 1.0), nothing)
+        goals.follow(handle, ended_by(node, error, node.now_s + 1.0))
     assert node.cancelled == node.asked
     assert node.running == []
 
@@ -281,20 +281,20 @@ def test_a_goal_that_is_left_is_cancelled_and_waited_for(taken, error):
 def test_a_goal_that_does_not_end_is_not_waited_for_for_ever(taken):
     node, goals = taken()
     node.ends_after_s = 1e9
-    handle = goals.send("goal", nothing, nothing)
+    handle = goals.send("goal", nothing)
     cancelled_s = node.now_s
     with pytest.raises(Interrupted):
-        goals.follow(handle, ended_by(node, Interrupted("enough"), cancelled_s), nothing)
+        goals.follow(handle, ended_by(node, Interrupted("enough"), cancelled_s))
     assert node.now_s - cancelled_s == pytest.approx(GOAL_ENDS_WITHIN_S, abs=0.1)
 
 
 def test_a_goal_of_a_node_that_was_started_anew_is_not_waited_for(taken):
     node, goals = taken()
-    handle = goals.send("goal", nothing, nothing)
+    handle = goals.send("goal", nothing)
     node.results.clear()
     node.running.clear()
     with pytest.raises(NodeAway, match="its node does not know the goal"):
-        goals.follow(handle, nothing, nothing)
+        goals.follow(handle, nothing)
     assert node.now_s < 1.0
 
 

@@ -18,6 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from robot_at_hand import own_time
 
+from tactile_resonance import msg
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import HoldMode
@@ -28,7 +29,7 @@ from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, Manage
 from tactile_resonance.nodes.messages import poles_to_message
 from tactile_resonance.nodes.node_watch import SILENT_S, ScanTime
 from tactile_resonance.nodes.parameters import Fixed
-from tactile_resonance.nodes.running import initialised
+from tactile_resonance.nodes.running import BEATS, RESULTS, initialised
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact
 from tactile_resonance.poles.result import Poles
@@ -134,7 +135,7 @@ class Tip:
         self.off_m, self.early_below_m, self.tissue_moves_m, self.stopped = 1e-4, 0.0, 0.0, False
         self.asked_m = []
 
-    def hold(self, pose, force_n, hold, check, poll, standoff_m=math.inf):
+    def hold(self, pose, force_n, hold, check, standoff_m=math.inf):
         self.asked_m.append(standoff_m)
         if standoff_m <= self.early_below_m:
             raise SurfaceEarly("contact: surface_early")
@@ -144,11 +145,8 @@ class Tip:
         return 0.0
 
 
-def test_points_beside_each_other_are_begun_low_until_the_surface_is_met_too_early(
-    alone, monkeypatch
-):
+def test_points_beside_each_other_are_begun_low_until_the_surface_is_met_too_early(alone):
     hands = alone.start(Scanning).hands
-    monkeypatch.setattr(hands, "_poll_of", lambda topics: lambda: None)
     with hands.listening():
         tip = hands._tip = Tip()
         hands.standoffs = Standoffs(Plane())
@@ -181,6 +179,45 @@ def test_points_beside_each_other_are_begun_low_until_the_surface_is_met_too_ear
                 touch(x_m)
             assert math.isfinite(tip.asked_m[-1]) == known
         hands._tip = None
+
+
+def test_a_touch_of_a_surface_is_repeated_with_a_contact_node_that_was_started_anew(alone):
+    node = alone.start(Scanning)
+    other = Node("contact_node", namespace=node.get_namespace())
+    alone.executor.add_node(other)
+    other.create_publisher(msg.ContactState, "contact_state", RESULTS)
+    beats = other.create_publisher(msg.Heartbeat, "heartbeat", BEATS)
+    name, hands, attempts = other.get_fully_qualified_name(), node.hands, []
+
+    def beat(instance):
+        beats.publish(msg.Heartbeat(node=name, state="active", instance=instance))
+        return bool(hands._nodes.instances(["contact_state"]))
+
+    def touch(pose, force_n, check):
+        attempts.append(None)
+        while len(attempts) == 1:  # until the restart is noticed
+            check()
+        ends = patience()
+        while beats.get_subscription_count() and len(found) < 5:  # and from then on it is at work
+            check()
+            ends()
+            found.append(None)
+        return SimpleNamespace(surface_m=1e-4, surface_std_m=2e-5, force_n=force_n)
+
+    found = []
+    point = ScanPoint(0, PLACE_M, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))
+    with hands.listening():
+        hands._tip = SimpleNamespace(touch=touch, stopped=False)
+        assert spin_until(alone.executor, lambda: beat(1))
+        search = threading.Thread(
+            target=lambda: found.append(hands.find(point, 0.01, 1e-3, patience()))
+        )
+        search.start()
+        assert spin_until(alone.executor, lambda: attempts)
+        assert spin_until(alone.executor, lambda: beat(2) and not search.is_alive())
+        search.join()
+        hands._tip = None
+    assert found[-1].ball_m[2] == pytest.approx(1.1e-3)
 
 
 GIVEN = {"beam_tilt_rad": 0.2, "limits.depth_m": 3.5e-3, "contact.standoff_m": 4e-3}
@@ -294,15 +331,15 @@ def test_blocks_of_somebody_else_do_not_stop_the_time_of_a_contact():
     with device() as clock, scan.conducted():
         begun_ns = clock.ask_ns()
 
-        def follow(goal, check, poll):
+        def follow(goal, check):
             for n in (1, 2, 3):
                 clock.hold(begun_ns + n * BLOCK_NS, Demand.FAST)
-                clock.wait_told(lambda: (ends(), poll()))
+                clock.wait_told(check)
                 assert stands(scan)
             return "reached"
 
-        goals = SimpleNamespace(send=lambda goal, check, poll: goal, follow=follow)
-        assert tip._sent(goals, "goal", ends, lambda: None) == "reached"
+        goals = SimpleNamespace(send=lambda goal, check: goal, follow=follow)
+        assert tip._sent(goals, "goal", ends) == "reached"
 
 
 def test_time_of_a_scan_never_goes_back_though_a_bench_begins_anew():

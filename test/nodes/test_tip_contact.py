@@ -49,7 +49,7 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     tip._state, tip._held_ns, tip.stopped, tip._instance = UNKNOWN, 0, False, 0
     tip._times, tip._low = StateTimes(), False
 
-    def make(goal, check, poll):
+    def make(goal, check):
         for state, seconds in (("settle", 4.9), ("hold", 5.0), ("hold", 5.04), ("hold", 5.08)):
             message = msg.ContactState(state=state)
             message.header.stamp = time_message(round(seconds * 1e9))
@@ -57,7 +57,7 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
         return SimpleNamespace(contact_s=0.3)
 
     monkeypatch.setattr(tip, "_make", make)
-    tip.hold(PoseStamped(), 0.01, HoldMode.FORCE, lambda: None, lambda: None)
+    tip.hold(PoseStamped(), 0.01, HoldMode.FORCE, lambda: None)
     assert tip.touched_ns == 4_700_000_000
     assert tip.spent_s["press_s"] == pytest.approx(0.1)
     assert tip.spent_s["hold_s"] == pytest.approx(0.08)
