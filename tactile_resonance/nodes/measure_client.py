@@ -6,7 +6,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -208,10 +208,8 @@ class ScanRecorder:
         self._lock = threading.Lock()
         self._recording: PointRecording | None = None
         self._measurement_id = 0
-        self._counts: Counter[str] = Counter()
-        self._played: set[int] = set()  # excitation ids of the records that came
-        self._described: set[int] = set()  # and of the excitations
-        self._blocks: set[tuple[str, int, int]] = set()  # topic, excitation id, stamp [ns]
+        # what came on each topic of a measurement: excitation id, stamp [ns]
+        self._came: dict[str, set[tuple[int, int]]] = defaultdict(set)
         for topic, recorded in TOPICS.items():
             self._listen(node, topic, recorded)
 
@@ -220,8 +218,7 @@ class ScanRecorder:
         """Write what comes meanwhile there; of measurements only this one."""
         with self._lock:
             self._recording, self._measurement_id = recording, measurement_id
-            for kept in (self._counts, self._played, self._described, self._blocks):
-                kept.clear()
+            self._came.clear()
             self.force_reason, self.distortion = "", ()
             while not self.poles.empty():
                 self.poles.get()
@@ -237,8 +234,9 @@ class ScanRecorder:
         A record without its excitation could not be evaluated again.
         """
         with self._lock:
-            counts = {r.each_block: self._counts[t] for t, r in TOPICS.items() if r.each_block}
-            undescribed = len(self._played - self._described)
+            counts = {r.each_block: len(self._came[t]) for t, r in TOPICS.items() if r.each_block}
+            played, described = ({i for i, _ in self._came[t]} for t in ("record", "excitation"))
+        undescribed = len(played - described)
         if undescribed == 0 and all(count >= blocks for count in counts.values()):
             return ""
         came = ", ".join(f"{count} {name}" for name, count in counts.items())
@@ -262,22 +260,18 @@ class ScanRecorder:
                     message = deserialize_message(cdr, recorded.kind)
                     if message.measurement_id != self._measurement_id:
                         return
-                if recorded.each_block:
-                    stamp_ns = time_from_message(message.header.stamp)
-                    block = topic, message.excitation_id, stamp_ns
-                    if block in self._blocks:  # it came twice, and would count as another one
-                        return
-                    self._blocks.add(block)
+                    what = message.excitation_id, time_from_message(message.header.stamp)
+                    if recorded.each_block and what in self._came[topic]:
+                        return  # it came twice, and would count as another one
                 self._recording.write(full, name, time.time_ns(), cdr, qos)
-                self._counts[topic] += 1
+                if not recorded.measured:
+                    return
+                self._came[topic].add(what)
                 if topic == "poles":
                     self.poles.put(message)
                 elif topic == "frf":
                     self.distortion = each_from_message(BandDistortion, message.distortion)
-                elif topic == "excitation":
-                    self._described.add(message.excitation_id)
                 elif topic == "record":
-                    self._played.add(message.excitation_id)
                     self.force_reason = message.contact_reason or self.force_reason
 
         node.listen(recorded.kind, topic, heard, recorded.qos, raw=True)

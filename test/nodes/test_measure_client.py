@@ -68,7 +68,7 @@ def tell(bench, number):
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
+def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, monkeypatch, late):
     start, executor = nodes
     bench = start(FakeHardwareNode)
     if late:  # the recorder's subscription is made, or matched, after the bench spoke
@@ -77,11 +77,15 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, late):
     plan = [ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))]
     with RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run:
         with run.begin_point(0) as recording:
+            write, topics = recording.write, []
+            monkeypatch.setattr(
+                recording, "write", lambda topic, *of: (topics.append(topic), write(topic, *of))
+            )
             with recorder.recording(recording, KEY):
                 assert spin_until(executor, bench._touch.truths.get_subscription_count)
                 if not late:
                     tell(bench, TRUTHS)
-                assert spin_until(executor, lambda: recorder._counts["bench/truth"] >= TRUTHS)
+                assert spin_until(executor, lambda: topics.count("/bench/truth") >= TRUTHS)
             recording.finish(PointResult(0, measurement_id=KEY))
         (result,) = run.content.latest
         messages = read_messages(file_of(run.path, result), POLES_TYPE)
