@@ -7,7 +7,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -147,49 +147,32 @@ class BenchNow:
             self._publisher.publish(Clock(clock=time_message(self())))
 
 
-class BenchPlayer:
-    """Plays one excitation at a time, in a thread of its own.
+class Playing:
+    """An excitation that is played, in a thread of its own, until its end or until it is silenced.
 
     Parameters
     ----------
     time_server : str
         Address of the simulated time in which it plays; empty: the machine's clock.
+    ends_ns : iterable of int
+        ROS times of the ends of its blocks [ns].
+    hand_out : callable
+        Called in the thread with each of them, at that time.
+
+    Raises
+    ------
+    ClockLostError
+        If no bench serves the simulated time.
     """
 
-    def __init__(self, time_server: str) -> None:
-        self._time_server = time_server
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._clock: SimulatedClock | None = None
-
-    def play(
-        self,
-        excitation: Excitation,
-        start_ns: int,
-        hand_out: Callable[[int], None],
+    def __init__(
+        self, time_server: str, ends_ns: Iterable[int], hand_out: Callable[[int], None]
     ) -> None:
-        """Begin to play; what was played before must have been silenced.
-
-        Parameters
-        ----------
-        excitation : Excitation
-        start_ns : int
-            ROS time of the first sample [ns].
-        hand_out : callable
-            Called in the thread with the ROS time of the end of each block [ns], at that time.
-
-        Raises
-        ------
-        ClockLostError
-            If no bench serves the simulated time.
-        """
-        if self._time_server:
-            self._clock = SimulatedClock(self._time_server, "bench")
-        self._stop.clear()
+        self._clock = SimulatedClock(time_server, "bench") if time_server else None
+        self._stop = threading.Event()
 
         def play() -> None:
-            for count in range(1, excitation.periods + 1):
-                end_ns = start_ns + round(count * excitation.period_s * 1e9)
+            for end_ns in ends_ns:
                 if not self._wait_until(end_ns):
                     return
                 hand_out(end_ns)
@@ -202,12 +185,9 @@ class BenchPlayer:
         self._stop.set()
         if self._clock is not None:
             self._clock.interrupt()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        self._thread.join()
         if self._clock is not None:
             self._clock.close()
-            self._clock = None
 
     def _wait_until(self, time_ns: int) -> bool:
         """Wait for a ROS time [ns]; False where it was silenced meanwhile."""
@@ -235,7 +215,7 @@ class FakeHardwareNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("fake_hardware_node", PARAMETERS)
-        self._player = BenchPlayer(self.time_server)
+        self._playing: Playing | None = None
         self._played: tuple[int, Play.Response] | None = None  # what is played, and the answer
         self._touch: SimulatedTip | None = None
         (serves_contact,) = values(self, "serve_contact")
@@ -280,8 +260,9 @@ class FakeHardwareNode(ManagedNode):
         self._silence()
 
     def _silence(self) -> str:
-        self._player.silence()
-        self._played = None
+        if self._playing is not None:
+            self._playing.silence()
+        self._playing = self._played = None
         return ""
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
@@ -302,9 +283,12 @@ class FakeHardwareNode(ManagedNode):
             run = self._start(tip, so_far, int(entropy.generate_state(1, np.uint64)[0]), effects)
             self._silence()
             start_ns = self._now_ns()
-            self._player.play(
-                excitation, start_ns, self._hand_out(run, excitation, start_ns, so_far)
+            ends_ns = (
+                start_ns + round(count * excitation.period_s * 1e9)
+                for count in range(1, excitation.periods + 1)
             )
+            hand_out = self._hand_out(run, excitation, start_ns, so_far)
+            self._playing = Playing(self.time_server, ends_ns, hand_out)
         except (ValueError, ClockLostError) as error:
             response.message = str(error)
             return response
