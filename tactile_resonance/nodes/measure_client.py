@@ -93,7 +93,7 @@ class MeasureClient:
             sweep=design.sweep,
             bands=each_to_message(msg.Band, design.bands),
         )
-        with self.recorder.recording(recording, goal.measurement_id):
+        with self.recorder.recording(recording):
             return self._follow(goal, enough, check, held)
 
     def _follow(
@@ -207,17 +207,16 @@ class ScanRecorder:
         self.distortion: tuple[BandDistortion, ...] = ()
         self._lock = threading.Lock()
         self._recording: PointRecording | None = None
-        self._measurement_id = 0
         # what came on each topic of a measurement: excitation id, stamp [ns]
         self._came: dict[str, set[tuple[int, int]]] = defaultdict(set)
         for topic, recorded in TOPICS.items():
             self._listen(node, topic, recorded)
 
     @contextmanager
-    def recording(self, recording: PointRecording, measurement_id: int) -> Iterator[None]:
-        """Write what comes meanwhile there; of measurements only this one."""
+    def recording(self, recording: PointRecording) -> Iterator[None]:
+        """Write what comes meanwhile there; of measurements only its own."""
         with self._lock:
-            self._recording, self._measurement_id = recording, measurement_id
+            self._recording = recording
             self._came.clear()
             self.force_reason, self.distortion = "", ()
             while not self.poles.empty():
@@ -258,7 +257,7 @@ class ScanRecorder:
                     return
                 if recorded.measured:
                     message = deserialize_message(cdr, recorded.kind)
-                    if message.measurement_id != self._measurement_id:
+                    if message.measurement_id != self._recording.measurement_id:
                         return
                     what = message.excitation_id, time_from_message(message.header.stamp)
                     if recorded.each_block and what in self._came[topic]:

@@ -77,11 +77,12 @@ def test_truths_told_in_one_go_are_all_recorded(nodes, tmp_path, monkeypatch, la
     plan = [ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))]
     with RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run:
         with run.begin_point(0) as recording:
+            recording.measurement_id = KEY
             write, topics = recording.write, []
             monkeypatch.setattr(
                 recording, "write", lambda topic, *of: (topics.append(topic), write(topic, *of))
             )
-            with recorder.recording(recording, KEY):
+            with recorder.recording(recording):
                 assert spin_until(executor, bench._touch.truths.get_subscription_count)
                 if not late:
                     tell(bench, TRUTHS)
@@ -120,7 +121,8 @@ def test_a_measurement_is_complete_with_all_of_its_excitations(nodes, tmp_path):
         RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run,
         run.begin_point(0) as recording,
     ):
-        with recorder.recording(recording, KEY):
+        recording.measurement_id = KEY
+        with recorder.recording(recording):
             tell("excitation", excitation_id=4)
             for excitation_id in (4, 5):  # two realisations of a block each
                 for topic in ("record", "frf", "poles"):
