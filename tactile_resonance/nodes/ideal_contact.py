@@ -65,7 +65,6 @@ class IdealContact:
         (self._base_frame,) = values(node, "base_frame")
         place = Contact(position_m=tip.above_table(CLEAR_M), frame_id=self._base_frame)
         tip.stays.add(Stay(0, 0.0, pose_to_message(place)))
-        self._lock = threading.Lock()
         self._drawn_back = threading.Event()
         self._state: State = State.IDLE
         self._result: ContactResult | None = None
@@ -84,28 +83,21 @@ class IdealContact:
         )
 
     async def _on_goal(self, goal: ServerGoalHandle) -> MakeContact.Result:
-        result = await in_thread(self._node, lambda: self._make(goal.request), "ideal contact")
+        try:
+            self._check(goal.request)
+        except ValueError as error:
+            result = not_reached(refusal_cause(error), str(error))
+        else:
+            self._drawn_back.clear()  # a stop after this is seen in the wait, one before in the refusal
+            self._say(State.APPROACH)
+            result = await in_thread(self._node, lambda: self._touch(goal.request), "ideal contact")
         if goal.is_cancel_requested:
             self.draw_back()  # for a cancellation before the work began
         end_goal(goal, result.reached and not goal.is_cancel_requested)
         return contact_result(result)
 
-    def _make(self, request: MakeContact.Goal) -> ContactResult:
-        """Bring the tip there, taking as long as a contact takes."""
-        if not self._lock.acquire(blocking=False):
-            return not_reached(Cause.BUSY, "goal: a contact is under way")
-        try:
-            self._drawn_back.clear()  # a stop after this is seen in the wait, one before in the refusal
-            try:
-                self._check(request)
-            except ValueError as error:
-                return not_reached(refusal_cause(error), str(error))
-            return self._touch(request)
-        finally:
-            self._lock.release()
-
     def _touch(self, request: MakeContact.Goal) -> ContactResult:
-        self._say(State.APPROACH)
+        """Bring the tip there, taking as long as a contact takes."""
         began_ns = self._tip.now_ns()
         if not self._wait(CONTACT_S):
             return self._say(State.IDLE, DRAWN_BACK)

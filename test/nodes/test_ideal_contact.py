@@ -304,6 +304,19 @@ def test_a_contact_that_is_cancelled_under_way_is_drawn_back(ideal, monkeypatch)
     assert ideal.state() == "idle"
 
 
+def test_a_goal_beside_one_under_way_is_refused_and_changes_nothing(ideal, monkeypatch):
+    monkeypatch.setattr(ideal_contact, "CONTACT_S", WITHIN_S)
+    _, future = ideal.make(goal_at())
+    ideal.wait(lambda: ideal.state() == "approach")
+    refused = ideal.answer(ideal.make(goal_at())[1]).result
+    assert (refused.reached, refused.cause) == (False, "busy")
+    assert "goal: refused in state approach" in refused.message
+    assert ideal.state() == "approach"
+    assert not future.done()
+    assert ideal.retract().success
+    assert ideal.answer(future).result.cause == "cancelled"
+
+
 def test_a_contact_that_is_cancelled_before_its_work_begins_leaves_no_tip_pressing(
     ideal, monkeypatch
 ):
