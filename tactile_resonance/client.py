@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from action_msgs.srv import CancelGoal
 from geometry_msgs.msg import Point, Pose, PoseArray
 from rclpy.action.client import ClientGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -21,6 +20,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+from unique_identifier_msgs.msg import UUID
 
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.msg import PointResult
@@ -180,10 +180,6 @@ class TactileClient:
         self._scans = GoalClient(node, Scan, f"{prefix}scan", callback_group=group)
         name = f"{prefix}calibrate_table"
         self._calibrations = GoalClient(node, CalibrateTable, name, callback_group=group)
-        self._cancel = [
-            node.create_client(CancelGoal, f"{prefix}{name}/_action/cancel_goal", callback_group=group)
-            for name in ("scan", "calibrate_table")
-        ]
         self._services = {
             name: node.create_client(Trigger, f"{prefix}scan/{name}", callback_group=group)
             for name in ("pause", "resume", "skip_point", "repeat_point", "rejection")
@@ -314,9 +310,9 @@ class TactileClient:
             self._asked.cancelled = True
             self._asked.send_cancellation()
             return
-        for cancel in self._cancel:
-            if cancel.service_is_ready():
-                cancel.call_async(CancelGoal.Request())  # without an id: all goals
+        for client in (self._scans, self._calibrations):
+            if client.server_is_ready():
+                ClientGoalHandle(client, UUID(), None).cancel_goal_async()  # without an id: all goals
 
     def pause(self) -> Future:
         """Wait with the tip free once the point under way is finished; as all below, a `Trigger.Response`."""
@@ -338,7 +334,7 @@ class TactileClient:
         """Take everything off the node again; a scan under way goes on, and is followed no longer."""
         self._node.destroy_timer(self._timer)
         self._node.destroy_subscription(self._points)
-        for service in (*self._services.values(), *self._cancel):
+        for service in self._services.values():
             self._node.destroy_client(service)
         self._scans.destroy()
         self._calibrations.destroy()

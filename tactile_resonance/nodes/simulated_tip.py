@@ -23,7 +23,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from tactile_resonance import msg
-from tactile_resonance.contact.force_spread import ForceSpread
+from tactile_resonance.contact.force_spread import ForceSpread, joined_spread
 from tactile_resonance.contact.vectors import Vector, vector
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import (
@@ -189,9 +189,7 @@ class Stays:
             text = f"the block begins before what is kept, {MOST_STAYS} places"
             return write_force_over(response, text)
         mean_n = sum(span_ns * force_n for span_ns, force_n in spans) / seen_ns
-        square = sum(span_ns * (force_n - mean_n) ** 2 for span_ns, force_n in spans) / seen_ns
-        forces_n = [force_n for _, force_n in spans]
-        spread = ForceSpread(square**0.5, min(forces_n), max(forces_n))
+        spread = joined_spread([(f, ForceSpread(0.0, f, f), span_ns) for span_ns, f in spans])
         return write_force_over(response, "", mean_n, 0.0, spread)
 
 
