@@ -97,10 +97,6 @@ PARAMETERS = (
 HUNG_S = 2.0
 
 
-class NotReady(DeviceError):
-    """The device does not answer; it may do so later."""
-
-
 class Cancelled(Exception):
     """The goal was cancelled."""
 
@@ -181,7 +177,9 @@ class ExcitationNode(ManagedNode):
         try:
             excitations = self._plan(goal.request)
             result.measurement_id = excitations[0].measurement_id
-            info = self._ready_device(excitations[0].sample_rate_hz)
+            result.outcome = Measure.Result.NOT_READY  # a device that does not answer may do so later
+            info = self._device.configure(excitations[0].sample_rate_hz)
+            result.outcome = Measure.Result.REFUSED
             check_output(excitations, info)
             store = self._open_store()
             if store is not None:
@@ -195,19 +193,11 @@ class ExcitationNode(ManagedNode):
             result.outcome = Measure.Result.CANCELLED
             result.message = f"cancelled after {counted(result.blocks, 'block')}"
         except (ValueError, OSError, DeviceError) as error:
-            if isinstance(error, NotReady):
-                result.outcome = Measure.Result.NOT_READY
             # devices raise DeviceError: what the operating system refused has to do with the records
             result.message = f"{NO_RECORDS if isinstance(error, OSError) else ''}{error}"
             failed = result.outcome == Measure.Result.FAILED
             self.health.error(f"{'failed' if failed else 'refused'}: {result.message}")
         return result
-
-    def _ready_device(self, sample_rate_hz: float) -> DeviceInfo:
-        try:
-            return self._device.configure(sample_rate_hz)
-        except DeviceError as error:
-            raise NotReady(str(error)) from error
 
     def _plan(self, goal: Measure.Goal) -> list[Excitation]:
         """What the device will play, with ids where neither goal nor device gives any."""

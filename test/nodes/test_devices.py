@@ -21,6 +21,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.task import Future
+from tactile_resonance.action import Measure
 from tactile_resonance.srv import ForceOver
 
 from tactile_resonance.configuration import share_path
@@ -80,6 +81,45 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
         node.trigger_configure()
         node.destroy_node()
     assert closed == [True]
+
+
+@pytest.mark.parametrize(
+    ("raises", "outcome"),
+    [
+        ("plan", Measure.Result.REFUSED),
+        ("configure", Measure.Result.NOT_READY),
+        ("", Measure.Result.REFUSED),
+        ("arm", Measure.Result.FAILED),
+    ],
+)
+def test_what_an_error_means_is_a_matter_of_how_far_the_measurement_came(
+    monkeypatch, tmp_path, raises, outcome
+):
+    class Device(SimpleNamespace):
+        def __getattr__(self, name):
+            def call(*arguments):
+                if name == raises:
+                    raise DeviceError(f"device: cannot {name}")
+                return arguments[0] if arguments else None
+
+            return call
+
+        def configure(self, rate_hz):
+            self.__getattr__("configure")(rate_hz)
+            peak_v = 0.0 if raises == "" else math.inf
+            return SimpleNamespace(name="weak", output_peak_v=peak_v)
+
+    monkeypatch.setattr(devices, "make_device", lambda _: (Device(), ()))
+    given = ["--ros-args", "-p", f"record_folder:={tmp_path}"]
+    with initialised(args=given, domain_id=free_domain_id(os.environ)):
+        node = ExcitationNode()
+        node.trigger_configure()
+        node.trigger_activate()
+        result = node._measure(SimpleNamespace(request=Measure.Goal(level_v=0.1)))
+        node.destroy_node()
+    assert result.outcome == outcome
+    expected = f"device: cannot {raises}" if raises else "level_v: peak"
+    assert result.message.startswith(expected)
 
 
 def test_records_go_where_the_parameter_says(tmp_path):
