@@ -109,8 +109,8 @@ def _bins(run: Path) -> tuple[str, object]:
     kept = kept_bins(run, BAND_HZ)
     if kept is None:
         return "", "made anew"
-    rows = [rows.read(0, rows.count).tobytes() for _, rows in kept.kinds]
-    return _text(([kind for kind, _ in kept.kinds], rows, kept.left_out)), ""
+    rows = [(piece.kind, piece.read().tobytes()) for piece in kept.pieces]
+    return _text((rows, kept.left_out)), ""
 
 
 def _text(content: object) -> str:

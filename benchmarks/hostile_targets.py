@@ -221,9 +221,9 @@ def _of_run(folder: Path, run: Path) -> Iterable[Target]:
 
     def bins_file(path: Path) -> None:
         kept = kept_bins(path.parent, BAND_HZ)
-        for kind, rows in kept.kinds if kept else ():
-            for row in rows.read(0, min(rows.count, 8)):
-                kind.bins(row)
+        for piece in kept.pieces if kept else ():
+            for row in piece.read()[:8]:
+                piece.kind.bins(row)
 
     readers = dict.fromkeys(("run.json", "index.jsonl", "scene.yaml"), read_run)
     for name, of_folder in readers.items():

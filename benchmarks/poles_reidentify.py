@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.poles_plant import BAND_HZ, HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD, Plant
 from tactile_resonance.poles.structure import ModelStructure
-from tactile_resonance.scan.kept_bins import NAME, BinsKind, Rows, RowsWriter, finish, kept_bins
+from tactile_resonance.scan.kept_bins import BinsKind, kept_bins, write_bins
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.reidentify import reidentify
 from tactile_resonance.scan.run_directory import RunDirectory
@@ -80,10 +80,8 @@ def _stored(run: Path, points: int) -> int:
         rows["index"] = start + np.arange(AT_ONCE)
         rows["u"][:, 0], rows["y"][:, 0] = PLANT.noisy(rng, AT_ONCE, bins)
         parts.append(rows)
-    with RowsWriter(run / NAME) as writer:
-        for k in range(points // AT_ONCE):
-            writer.append("points_0", parts[k % len(parts)])
-        finish(writer, [kind], BAND_HZ, {}, [])
+    each = ((kind, parts[k % len(parts)]) for k in range(points // AT_ONCE))
+    write_bins(run, each, BAND_HZ, {}, [])
     return kind.dtype.itemsize
 
 
@@ -91,10 +89,9 @@ def _reading_s(run: Path) -> float:
     """Wall clock of reading all rows in pieces."""
     kept = kept_bins(run, BAND_HZ)
     assert kept is not None
-    rows: Rows = kept.kinds[0][1]
     begun_s = time.perf_counter()
-    for start in range(0, rows.count, AT_ONCE):
-        rows.read(start, min(start + AT_ONCE, rows.count))
+    for piece in kept.pieces:
+        piece.read()
     return time.perf_counter() - begun_s
 
 

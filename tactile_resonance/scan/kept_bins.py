@@ -2,9 +2,10 @@
 """Bins of the band of every point of a run, kept beside its recording: what poles are identified from again.
 
 ``RUN/bins.npz`` follows from the recording and is made when it is first asked for: transforming the records
-takes a hundred times as long as the fit. Its arrays ``points_0``, ``points_1`` ... hold one row a point, one
-array for each kind of record: index, attempt, measurement_id, x_m, y_m, z_m, and u and y, (M, K) bins in single
-precision. ``kinds`` says in JSON what the rows of each have in common, which files all were made of, and what
+takes a hundred times as long as the fit. Its arrays hold one row a point: index, attempt, measurement_id, x_m,
+y_m, z_m, and u and y, (M, K) bins in single precision. ``points_0_0``, ``points_0_1`` ... are of one kind of
+record, ``points_1_0`` ... of the next, each no larger than what a process takes at once. ``kinds`` says in JSON
+what the rows of each kind have in common and how many each array has, which files all were made of, and what
 was left out.
 """
 
@@ -17,10 +18,9 @@ import shutil
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,18 +32,13 @@ from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.recorded import recording_of_point
 from tactile_resonance.scan.run_content import RECORDING, read_run
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 NAME = "bins.npz"
-FORMAT = "tactile_resonance bins 1"
+FORMAT = "tactile_resonance bins 2"
+BYTES_AT_ONCE = 16_000_000
+"""Of the bins that a process takes together: one array of the file."""
 PLACE = {"index": "<i4", "attempt": "<i4", "measurement_id": "<i8"}
 PLACE |= dict.fromkeys(("x_m", "y_m", "z_m"), "<f8")
 """Types of what says which point a row is of, by name."""
-_LOCAL_HEADER = (
-    30  # bytes of a member's header before its name (PKWARE APPNOTE 6.3.10, section 4.3.7)
-)
-_LENGTHS = 26  # where the lengths of its name and of what follows it stand
 
 
 @dataclass(frozen=True)
@@ -92,10 +87,25 @@ class BinsKind:
 
 
 @dataclass(frozen=True)
-class KeptBins:
-    """The points of a run by the kinds of their records; points without bins, and why."""
+class Piece:
+    """An array of rows of one kind, in a file that was found to be whole."""
 
-    kinds: tuple[tuple[BinsKind, Rows], ...]
+    kind: BinsKind
+    path: Path
+    name: str
+    count: int
+
+    def read(self) -> npt.NDArray:
+        """(count,) rows."""
+        with np.load(self.path) as arrays:
+            return np.asarray(arrays[self.name])
+
+
+@dataclass(frozen=True)
+class KeptBins:
+    """The points of a run, one kind of their records after the other; points without bins, and why."""
+
+    pieces: tuple[Piece, ...]
     left_out: tuple[str, ...]
 
 
@@ -112,7 +122,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         return None
     try:
         with np.load(path) as arrays:
-            if arrays.zip.testzip() is not None:  # rows are read past its checksums
+            if arrays.zip.testzip() is not None:
                 return None
             content = json.loads(str(arrays["kinds"]))
         low_hz, high_hz = content["band_hz"]
@@ -121,7 +131,11 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         kinds = [
             BinsKind(**{**kind, "harmonics": tuple(kind["harmonics"])}) for kind in content["kinds"]
         ]
-        rows = [Rows.of(path, f"points_{k}") for k in range(len(kinds))]
+        pieces = [
+            Piece(kind, path, f"points_{k}_{j}", count)
+            for k, (kind, counts) in enumerate(zip(kinds, content["counts"], strict=True))
+            for j, count in enumerate(counts)
+        ]
     except (
         ValueError,
         KeyError,
@@ -133,8 +147,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
     ):  # damaged: it is made again
         return None
     within = low_hz <= band_hz[0] and band_hz[1] <= high_hz
-    pairs = tuple(zip(kinds, rows, strict=True))
-    return KeptBins(pairs, tuple(content["left_out"])) if within else None
+    return KeptBins(tuple(pieces), tuple(content["left_out"])) if within else None
 
 
 def bins_of_point(
@@ -187,39 +200,57 @@ def keep_bins(
         If the folder cannot be written.
     """
     files, content = _files(run), read_run(run)
-    kinds: dict[BinsKind, str] = {}
     left_out = list(content.problems)
-    with RowsWriter(run / NAME) as writer:
+
+    def rows() -> Iterator[tuple[BinsKind, npt.NDArray]]:
         jobs = ((run, result, band_hz) for result in content.latest)
         for done, found in enumerate(each(bins_of_point, jobs), start=1):
             progress(f"bins of {run.name}", done, len(content.latest))
             if isinstance(found, str):
                 left_out.append(found)
-                continue
-            kind, row = found
-            writer.append(kinds.setdefault(kind, f"points_{len(kinds)}"), row)
-        finish(writer, list(kinds), band_hz, files, left_out)
+            else:
+                yield found
+
+    write_bins(run, rows(), band_hz, files, left_out)
     kept = kept_bins(run, band_hz)
     assert kept is not None
     return kept
 
 
-def finish(
-    writer: RowsWriter,
-    kinds: list[BinsKind],
+def write_bins(
+    run: Path,
+    found: Iterable[tuple[BinsKind, npt.NDArray]],
     band_hz: tuple[float, float],
     files: dict[str, int],
     left_out: list[str],
 ) -> None:
-    """Complete a file of bins whose rows ``points_0`` ... are written."""
-    content: dict[str, Any] = {
-        "format": FORMAT,
-        "band_hz": list(band_hz),
-        "kinds": [asdict(kind) for kind in kinds],
-        "files": files,
-        "left_out": left_out,
-    }
-    writer.finish(kinds=np.array(json.dumps(content)))
+    """Write ``bins.npz`` of rows with their kinds; what is left out may be added to while these come."""
+    waiting: dict[BinsKind, list[npt.NDArray]] = {}  # in the order in which kinds came first
+    counts: dict[BinsKind, list[int]] = {}
+    with whole_npz(run / NAME) as members:
+
+        def write(kind: BinsKind) -> None:
+            rows, of_kind = np.concatenate(waiting[kind]), counts.setdefault(kind, [])
+            write_array(members, f"points_{[*waiting].index(kind)}_{len(of_kind)}", rows)
+            of_kind.append(rows.size)
+            waiting[kind].clear()
+
+        for kind, rows in found:
+            own = waiting.setdefault(kind, [])
+            if own and (len(own) + 1) * rows.nbytes > BYTES_AT_ONCE:
+                write(kind)
+            own.append(rows)
+        for kind in waiting:
+            write(kind)
+        content = {
+            "format": FORMAT,
+            "band_hz": list(band_hz),
+            "kinds": [asdict(kind) for kind in waiting],
+            "counts": [counts[kind] for kind in waiting],
+            "files": files,
+            "left_out": left_out,
+        }
+        write_array(members, "kinds", np.array(json.dumps(content)))
 
 
 def _files(run: Path) -> dict[str, int]:
@@ -227,92 +258,26 @@ def _files(run: Path) -> dict[str, int]:
     return {file.name: file.stat().st_size for file in sorted((run / RECORDING).glob("*.mcap"))}
 
 
-class RowsWriter:
-    """Writes an ``.npz`` file of structured arrays that grow; a context that leaves no half file behind.
-
-    Parameters
-    ----------
-    path : Path
-        Replaced by `finish`.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._part = path.with_name(path.name + ".part")
-        self._rows: dict[str, tuple[np.dtype, IO[bytes]]] = {}
-        self._files = contextlib.ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._files.close()
-        self._part.unlink(missing_ok=True)
-
-    def append(self, name: str, rows: npt.NDArray) -> None:
-        """Add rows (n,) to an array; all of them have one type."""
-        if name not in self._rows:
-            # without a name: whatever ends this process, nothing of it is left
-            file = self._files.enter_context(
-                tempfile.TemporaryFile(dir=self._path.parent)  # noqa: SIM115
-            )
-            self._rows[name] = rows.dtype, file
-        rows.tofile(self._rows[name][1])
-
-    def finish(self, **arrays: npt.NDArray) -> None:
-        """Give the file its name, with some whole arrays beside those of rows."""
-        with self._part.open("wb") as file:
-            with zipfile.ZipFile(file, "w", allowZip64=True) as members:
-                for name, (dtype, rows) in self._rows.items():
-                    count = rows.tell() // dtype.itemsize
-                    rows.seek(0)
-                    with members.open(f"{name}.npy", "w", force_zip64=True) as member:
-                        head = {
-                            "descr": np.lib.format.dtype_to_descr(dtype),
-                            "fortran_order": False,
-                            "shape": (count,),
-                        }
-                        np.lib.format.write_array_header_2_0(member, head)
-                        shutil.copyfileobj(rows, member, 1 << 20)
-                for name, array in arrays.items():
-                    with members.open(f"{name}.npy", "w") as member:
-                        np.lib.format.write_array(member, array, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        self._part.replace(self._path)
+@contextlib.contextmanager
+def whole_npz(path: Path) -> Iterator[zipfile.ZipFile]:
+    """An ``.npz`` file to be written array by array, which is there whole or not at all."""
+    part = path.with_name(path.name + ".part")
+    # without a name: whatever ends this process, nothing of it is left
+    with tempfile.TemporaryFile(dir=path.parent) as growing:
+        with zipfile.ZipFile(growing, "w") as members:
+            yield members
+        growing.seek(0)
+        try:
+            with part.open("wb") as file:
+                shutil.copyfileobj(growing, file, 1 << 20)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Rows in a file of `RowsWriter`, read in pieces.
-
-    Attributes
-    ----------
-    path : Path
-    dtype : numpy.dtype
-    count : int
-    offset : int
-        Of the first one in the file [bytes].
-    """
-
-    path: Path
-    dtype: np.dtype
-    count: int
-    offset: int
-
-    @classmethod
-    def of(cls, path: Path, name: str) -> Rows:
-        """Array of a file that was found to be whole."""
-        with path.open("rb") as file, zipfile.ZipFile(file) as members:
-            info = members.getinfo(f"{name}.npy")
-            file.seek(info.header_offset + _LENGTHS)
-            lengths = struct.unpack("<HH", file.read(4))
-            file.seek(info.header_offset + _LOCAL_HEADER + sum(lengths))
-            np.lib.format.read_magic(file)
-            shape, _, dtype = np.lib.format.read_array_header_2_0(file)
-            return cls(path, dtype, shape[0], file.tell())
-
-    def read(self, start: int, stop: int) -> npt.NDArray:
-        """(stop - start,) rows."""
-        offset = self.offset + start * self.dtype.itemsize
-        return np.fromfile(self.path, self.dtype, stop - start, offset=offset)
+def write_array(members: zipfile.ZipFile, name: str, array: npt.NDArray) -> None:
+    """Add an array to an ``.npz`` file."""
+    with members.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, array, allow_pickle=False)

@@ -32,17 +32,15 @@ from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.kept_bins import (
     PLACE,
     BinsKind,
-    KeptBins,
-    Rows,
-    RowsWriter,
+    Piece,
     keep_bins,
     kept_bins,
+    whole_npz,
+    write_array,
 )
 from tactile_resonance.scan.run_content import read_plan
 from tactile_resonance.scan.scene import SensorUse
 
-BYTES_AT_ONCE = 16_000_000
-"""Of the bins that a process takes together."""
 STATUS = "poles_status"
 # What one process is given beforehand, so that none waits for work.
 _AHEAD = 2
@@ -147,46 +145,38 @@ def reidentify(
         for run, band, model in zip(runs, bands, structures, strict=True):
             kept.append(kept_bins(run, band) or keep_bins(run, band, processes.in_order, progress))
             left_out += [f"{run}: {text}" for text in kept[-1].left_out]
-            for kind, _ in kept[-1].kinds:
-                _plan(kind, band, model)  # raises what does not suit
-        total, done = sum(rows.count for of_run in kept for _, rows in of_run.kinds), 0
+            for piece in kept[-1].pieces:
+                _plan(piece.kind, band, model)  # raises what does not suit
+        total, done = sum(piece.count for of_run in kept for piece in of_run.pieces), 0
         if total == 0:
             raise ValueError(f"no point to identify: {'; '.join(left_out[:3]) or 'none is finished'}")
         jobs = (
-            (dtype, k, str(runs[k]), *piece, bands[k], structures[k])
+            (dtype, k, str(runs[k]), piece, bands[k], structures[k])
             for k, of_run in enumerate(kept)
-            for piece in _pieces(of_run)
+            for piece in of_run.pieces
         )
+        head = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (total,)}
         try:
-            with RowsWriter(npz) as writer, part.open("w", encoding="utf-8") as text:
+            with part.open("w", encoding="utf-8") as text, whole_npz(npz) as members:
                 text.write(",".join(dtype.names or ()) + "\n")
-                writer.append("points", np.zeros(0, dtype))
-                for rows, lines in processes.in_order(_identified, jobs):
-                    writer.append("points", rows)
-                    text.write(lines)
-                    codes = np.bincount(rows[STATUS], minlength=len(STATUSES))
-                    counts.update(dict(zip(_STATUSES, codes.tolist(), strict=True)))
-                    done += rows.size
-                    progress("poles", done, total)
+                with members.open("points.npy", "w", force_zip64=True) as points:
+                    np.lib.format.write_array_header_2_0(points, head)
+                    for rows, lines in processes.in_order(_identified, jobs):
+                        points.write(rows.tobytes())
+                        text.write(lines)
+                        codes = np.bincount(rows[STATUS], minlength=len(STATUSES))
+                        counts.update(dict(zip(_STATUSES, codes.tolist(), strict=True)))
+                        done += rows.size
+                        progress("poles", done, total)
+                write_array(members, "runs", np.array([str(run) for run in runs]))
+                write_array(members, "poles_statuses", np.array(_STATUSES))
+                write_array(members, "bands_hz", np.array(bands))
                 text.flush()
                 os.fsync(text.fileno())
-                writer.finish(
-                    runs=np.array([str(run) for run in runs]),
-                    poles_statuses=np.array(_STATUSES),
-                    bands_hz=np.array(bands),
-                )
-                part.replace(csv)
+            part.replace(csv)
         finally:
             part.unlink(missing_ok=True)
     return +counts, left_out
-
-
-def _pieces(kept: KeptBins) -> Iterator[tuple[BinsKind, Rows, int, int]]:
-    """Some rows of one kind each, from the one to the other."""
-    for kind, rows in kept.kinds:
-        size = max(1, BYTES_AT_ONCE // rows.dtype.itemsize)
-        for start in range(0, rows.count, size):
-            yield kind, rows, start, min(start + size, rows.count)
 
 
 @lru_cache(maxsize=32)
@@ -203,8 +193,9 @@ def _plan(kind: BinsKind, band_hz: tuple[float, float], structure: ModelStructur
 
 def _identified(job: tuple) -> tuple[npt.NDArray, str]:
     """(n,) results of some points of one kind, and their lines of the table."""
-    dtype, run, name_of_run, kind, source, start, stop, band_hz, structure = job
-    points = source.read(start, stop)
+    piece: Piece
+    dtype, run, name_of_run, piece, band_hz, structure = job
+    points, kind = piece.read(), piece.kind
     plan = _plan(kind, band_hz, structure)
     first = plan.bins[0] - kind.first_bin
     here = slice(first, first + plan.bins.size)

@@ -2,6 +2,7 @@
 """Poles of all points of runs again: those of `analyze`, whole files or none, and in pieces of bounded size."""
 
 import array
+import contextlib
 import csv
 import fcntl
 import json
@@ -18,8 +19,8 @@ import numpy as np
 import pytest
 
 from tactile_resonance.cli import main
-from tactile_resonance.scan import reidentify as module
-from tactile_resonance.scan.kept_bins import Rows, RowsWriter
+from tactile_resonance.scan import kept_bins, reidentify
+from tactile_resonance.scan.kept_bins import whole_npz, write_array
 from tactile_resonance.scan.messages import to_cdr
 from tactile_resonance.scan.run_directory import RunDirectory
 
@@ -216,23 +217,46 @@ def test_what_it_refuses(runs, tmp_path, capsys):
 
 
 def test_pieces_bound_what_is_held_at_a_time(runs, tmp_path, monkeypatch):
-    """Whatever the pieces, the result is the same, and none reads more bytes than it may."""
+    """Whatever the pieces, the result is the same, and none has more bytes than it may."""
     assert main(["reidentify", str(runs[1]), "--output", str(tmp_path / "one")]) == 0
-    read, whole = [], Rows.read
-    monkeypatch.setattr(module, "BYTES_AT_ONCE", 1)
+    with np.load(runs[1] / "bins.npz") as bins:
+        together = bins["points_0_0"]
+    (runs[1] / "bins.npz").unlink()
+    read, whole = [], kept_bins.Piece.read
+    monkeypatch.setattr(kept_bins, "BYTES_AT_ONCE", 1)
     monkeypatch.setattr(
-        module._Processes, "in_order", lambda self, function, jobs: map(function, jobs)
+        reidentify._Processes, "in_order", lambda self, function, jobs: map(function, jobs)
     )
     monkeypatch.setattr(
-        Rows,
+        kept_bins.Piece,
         "read",
-        lambda self, start, stop: read.append(stop - start) or whole(self, start, stop),
+        lambda self: read.append(self.count) or whole(self),
     )
     assert main(["reidentify", str(runs[1]), "--output", str(tmp_path / "two")]) == 0
     assert read == [1, 1]
+    with np.load(runs[1] / "bins.npz") as bins:
+        assert sorted(bins) == ["kinds", "points_0_0", "points_0_1"]
+        np.testing.assert_array_equal(
+            np.concatenate([bins["points_0_0"], bins["points_0_1"]]), together
+        )
     one, two = table(tmp_path / "one.csv"), table(tmp_path / "two.csv")
+    assert len(one) == 2
     for a, b in zip(one, two, strict=True):
         assert float(a["f0_hz"]) == pytest.approx(float(b["f0_hz"]), rel=1e-9)
+
+
+def test_bins_of_another_format_are_made_again(tmp_path, capsys):
+    run = make_run(tmp_path / "run", [list(measurement(100))])
+    assert main(["reidentify", str(run)]) == 0
+    with np.load(run / "bins.npz") as bins:
+        content = json.loads(str(bins["kinds"]))
+    # as the first one was: an array for each kind, however large
+    content["format"] = "tactile_resonance bins 1"
+    del content["counts"]
+    np.savez(run / "bins.npz", kinds=np.array(json.dumps(content)), points_0=np.zeros(1))
+    capsys.readouterr()
+    assert main(["reidentify", str(run)]) == 0
+    assert "bins of run: 1 of 1" in capsys.readouterr().out
 
 
 def test_an_interrupted_one_leaves_what_was_there(runs, tmp_path):
@@ -284,22 +308,19 @@ def test_an_interrupted_one_leaves_what_was_there(runs, tmp_path):
     assert not list(run.glob("*.part"))
 
 
-def test_rows_come_back_in_pieces_and_an_unfinished_file_is_none(tmp_path):
-    path = tmp_path / "rows.npz"
-    rows = np.zeros(10, [("a", "<i4"), ("b", "<c8", (2, 3))])
+def test_an_unfinished_file_is_none(tmp_path):
+    path, rows = tmp_path / "rows.npz", np.zeros(10, [("a", "<i4"), ("b", "<c8", (2, 3))])
     rows["a"], rows["b"] = np.arange(10), 1j
-    with RowsWriter(path) as writer:
-        writer.append("x", rows[:4])
-        writer.append("x", rows[4:])
+    with contextlib.suppress(KeyError), whole_npz(path) as members:
+        write_array(members, "x", rows)
+        raise KeyError
     assert not list(tmp_path.iterdir())
-    with RowsWriter(path) as writer:
-        writer.append("x", rows[:4])
-        writer.append("x", rows[4:])
-        writer.finish(more=np.array("text"))
+    with whole_npz(path) as members:
+        write_array(members, "x", rows)
+        write_array(members, "more", np.array("text"))
+        assert not list(tmp_path.iterdir())
+    assert [file.name for file in tmp_path.iterdir()] == ["rows.npz"]
     assert zipfile.ZipFile(path).testzip() is None
     with np.load(path) as arrays:
         np.testing.assert_array_equal(arrays["x"], rows)
         assert arrays["more"] == "text"
-    kept = Rows.of(path, "x")
-    assert kept.count == 10
-    np.testing.assert_array_equal(kept.read(3, 7), rows[3:7])
