@@ -142,8 +142,9 @@ def _on_the_way(start: Pose, end: Pose) -> tuple[FloatArray, Rotation]:
 def _lowest(places_m: FloatArray, surface: Surface, drop_m: FloatArray | float = 0.0) -> float:
     """Least height of (..., 3) places, less a drop (...), over the surface under them, across its slope."""
     xy = places_m[..., :2]
-    surely = surface.height_m(xy) + SURE_STDS * surface.height_std_m(xy)
-    height = (places_m[..., 2] - surely) * surface.normal(xy)[..., 2] - drop_m
+    at, normal = surface.at(xy)
+    surely = at + SURE_STDS * surface.height_std_m(xy)
+    height = (places_m[..., 2] - surely) * normal[..., 2] - drop_m
     height = height[surface.known(xy) & np.isfinite(height)]
     return float(height.min(initial=math.inf))
 

@@ -206,7 +206,7 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
     if isinstance(under, TouchRequest):
         under = Plane((0.0, 0.0, under.expected_height_m))
     xy, given_z = scene.positions_m[:, :2], scene.positions_m[:, 2]
-    height, normals = under.height_m(xy), under.normal(xy)
+    height, normals = under.at(xy)
     z = np.where(np.isnan(given_z), height, given_z)
     off = np.isnan(z) | np.any(np.isnan(normals), axis=1)
     with np.errstate(invalid="ignore"):

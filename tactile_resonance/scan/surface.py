@@ -36,12 +36,16 @@ class Surface(ABC):
     """A surface seen from above: one height for each x, y. NaN where there is none."""
 
     @abstractmethod
-    def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(...) height [m] at (..., 2) positions [m]."""
+    def at(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(...) height [m] and (..., 3) outward (upward) unit normal at (..., 2) positions [m]."""
 
-    @abstractmethod
+    def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
+        """(...) height [m]."""
+        return self.at(xy_m)[0]
+
     def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(..., 3) outward (upward) unit normal at (..., 2) positions [m]."""
+        """(..., 3) unit normal."""
+        return self.at(xy_m)[1]
 
     def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) standard deviation of the height [m]; 0 where the surface is given."""
@@ -63,16 +67,12 @@ class Plane(Surface):
         good = bool(np.all(np.isfinite(self.normal_))) and self.normal_[2] > 0
         require(good, "normal", self.normal_, "a vector with z above 0")
 
-    def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(...) height [m]."""
-        xy, n = np.asarray(xy_m, float), self.normal_
-        offset = xy - self.point_m[:2]
-        return np.asarray(self.point_m[2] - offset @ np.asarray(n[:2]) / n[2])
-
-    def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(..., 3) unit normal."""
-        unit = np.asarray(self.normal_) / np.linalg.norm(self.normal_)
-        return np.broadcast_to(unit, (*np.shape(xy_m)[:-1], 3)).copy()
+    def at(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(...) height [m] and (..., 3) unit normal."""
+        xy, n = np.asarray(xy_m, float), np.asarray(self.normal_)
+        height = self.point_m[2] - (xy - self.point_m[:2]) @ n[:2] / n[2]
+        unit = np.broadcast_to(n / np.linalg.norm(n), (*xy.shape[:-1], 3))
+        return np.asarray(height), unit.copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +101,15 @@ class HeightField(Surface):
         good = bool(np.all(np.isfinite(self.z_m)))
         require(good, "z_m", int(np.sum(~np.isfinite(self.z_m))), "finite heights only")
 
-    def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(...) height [m], NaN outside of the grid."""
-        return self._evaluate(xy_m)
-
-    def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(..., 3) unit normal, NaN outside of the grid."""
-        return unit_normal(self._evaluate(xy_m, dx=1), self._evaluate(xy_m, dy=1))
+    def at(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(...) height [m] and (..., 3) unit normal, NaN outside of the grid."""
+        x, y = np.moveaxis(np.asarray(xy_m, float), -1, 0)
+        inside = self.known(xy_m)
+        height, slope_x, slope_y = (
+            np.where(inside, self._spline.ev(np.where(inside, x, self.x_m[0]), y, dx=dx, dy=dy), np.nan)
+            for dx, dy in ((0, 0), (1, 0), (0, 1))
+        )
+        return height, unit_normal(slope_x, slope_y)
 
     def known(self, xy_m: npt.ArrayLike) -> BoolArray:
         """(...) inside of the grid."""
@@ -118,12 +120,6 @@ class HeightField(Surface):
     def _spline(self) -> RectBivariateSpline:
         orders = [min(3, axis.size - 1) for axis in (self.x_m, self.y_m)]
         return RectBivariateSpline(self.x_m, self.y_m, self.z_m, kx=orders[0], ky=orders[1])
-
-    def _evaluate(self, xy_m: npt.ArrayLike, dx: int = 0, dy: int = 0) -> FloatArray:
-        x, y = np.moveaxis(np.asarray(xy_m, float), -1, 0)
-        inside = self.known(xy_m)
-        value = self._spline.ev(np.where(inside, x, self.x_m[0]), y, dx=dx, dy=dy)
-        return np.where(inside, value, np.nan)
 
 
 def unit_normal(slope_x: npt.ArrayLike, slope_y: npt.ArrayLike) -> FloatArray:
@@ -185,16 +181,8 @@ class TriangleMesh(Surface):
         require(mesh.is_winding_consistent, "triangles", "edges run twice in one sense", accepted)
         return cls(low + size * mesh.vertices, np.asarray(faces), np.asarray(mesh.vertex_normals))
 
-    def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(...) height of the topmost face [m], NaN beside the mesh."""
-        return self._over(xy_m)[0]
-
-    def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(..., 3) upward unit normal, NaN beside the mesh."""
-        return self._over(xy_m)[1]
-
-    def _over(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Height (...) and normal (..., 3)."""
+    def at(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(...) height [m] and (..., 3) upward unit normal of the topmost face, NaN beside the mesh."""
         xy = np.asarray(xy_m, float)
         points = xy.reshape(-1, 2)
         triangles = self.corners_m[self.faces]  # (t, 3, 3)

@@ -74,14 +74,10 @@ class TouchedSurface(Surface):
     residuals_m: FloatArray
     consistent: bool
 
-    def height_m(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(...) height [m]; beyond the contacts too, where `height_std_m` grows."""
-        return np.asarray(self._basis(xy_m)[0] @ self.coefficients_m)
-
-    def normal(self, xy_m: npt.ArrayLike) -> FloatArray:
-        """(..., 3) upward unit normal."""
-        _, by_x, by_y = self._basis(xy_m)
-        return unit_normal(by_x @ self.coefficients_m, by_y @ self.coefficients_m)
+    def at(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(...) height [m] and (..., 3) unit normal; beyond the contacts too, where `height_std_m` grows."""
+        value, by_x, by_y = (each @ self.coefficients_m for each in self._basis(xy_m))
+        return np.asarray(value), unit_normal(by_x, by_y)
 
     def height_std_m(self, xy_m: npt.ArrayLike) -> FloatArray:
         """(...) standard deviation of the height [m]."""
