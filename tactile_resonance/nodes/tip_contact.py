@@ -214,7 +214,7 @@ class TipContact:
         self.retract()
         self.touching = True
         self._state = UNKNOWN
-        self._times.begin()
+        self._times = StateTimes()
         self._time.go()
         check = self._going(check)
         return goals.follow(goals.send(goal, check), check)

@@ -7,7 +7,6 @@ tell the sensor's health.
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -286,39 +285,30 @@ def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, s
 
 
 FIELD_OF = {
-    State.TRAVEL: "travel_s",
-    State.TARE: "tare_s",
-    State.APPROACH: "approach_s",
-    State.CONTACT: "press_s",
-    State.SETTLE: "press_s",
-    State.HOLD: "hold_s",
-    State.RETRACT: "retract_s",
+    State.TRAVEL.value: "travel_s",
+    State.TARE.value: "tare_s",
+    State.APPROACH.value: "approach_s",
+    State.CONTACT.value: "press_s",
+    State.SETTLE.value: "press_s",
+    State.HOLD.value: "hold_s",
+    State.RETRACT.value: "retract_s",
 }
 """Of `PointResult`, by the state of a contact whose time it holds."""
 
 
 class StateTimes:
-    """Of one contact, from its states and the times at which each was seen; for several threads."""
+    """Of one contact, from its states and the times at which each was seen."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self.begin()
-
-    def begin(self) -> None:
-        """Forget what was before."""
-        with self._lock:
-            self._spent_ns: Counter[str] = Counter()
-            self._before: tuple[str, int] | None = None
+        self._spent_ns: Counter[str] = Counter()
+        self._before, self._since_ns = "", 0
 
     def take(self, state: str, time_ns: int) -> None:
         """The contact was in a state at a time; until then in the one before."""
-        with self._lock:
-            if self._before is not None:
-                known = {each.value: name for each, name in FIELD_OF.items()}
-                before, since_ns = self._before
-                if before in known and time_ns > since_ns:
-                    self._spent_ns[known[before]] += time_ns - since_ns
-            self._before = state, time_ns
+        field = FIELD_OF.get(self._before)
+        if field is not None and time_ns > self._since_ns:
+            self._spent_ns[field] += time_ns - self._since_ns
+        self._before, self._since_ns = state, time_ns
 
     @property
     def fields(self) -> dict[str, float]:
