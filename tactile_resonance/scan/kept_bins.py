@@ -20,6 +20,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -211,10 +212,7 @@ def keep_bins(
             else:
                 yield found
 
-    write_bins(run, rows(), band_hz, files, left_out)
-    kept = kept_bins(run, band_hz)
-    assert kept is not None
-    return kept
+    return write_bins(run, rows(), band_hz, files, left_out)
 
 
 def write_bins(
@@ -223,16 +221,17 @@ def write_bins(
     band_hz: tuple[float, float],
     files: dict[str, int],
     left_out: list[str],
-) -> None:
+) -> KeptBins:
     """Write ``bins.npz`` of rows with their kinds; what is left out may be added to while these come."""
     waiting: dict[BinsKind, list[npt.NDArray]] = {}  # in the order in which kinds came first
-    counts: dict[BinsKind, list[int]] = {}
+    pieces: dict[BinsKind, list[Piece]] = {}
     with whole_npz(run / NAME) as members:
 
         def write(kind: BinsKind) -> None:
-            rows, of_kind = np.concatenate(waiting[kind]), counts.setdefault(kind, [])
-            write_array(members, f"points_{[*waiting].index(kind)}_{len(of_kind)}", rows)
-            of_kind.append(rows.size)
+            rows, of_kind = np.concatenate(waiting[kind]), pieces.setdefault(kind, [])
+            name = f"points_{[*waiting].index(kind)}_{len(of_kind)}"
+            write_array(members, name, rows)
+            of_kind.append(Piece(kind, run / NAME, name, rows.size))
             waiting[kind].clear()
 
         for kind, rows in found:
@@ -246,11 +245,12 @@ def write_bins(
             "format": FORMAT,
             "band_hz": list(band_hz),
             "kinds": [asdict(kind) for kind in waiting],
-            "counts": [counts[kind] for kind in waiting],
+            "counts": [[piece.count for piece in pieces[kind]] for kind in waiting],
             "files": files,
             "left_out": left_out,
         }
         write_array(members, "kinds", np.array(json.dumps(content)))
+    return KeptBins(tuple(chain.from_iterable(pieces[kind] for kind in waiting)), tuple(left_out))
 
 
 def _files(run: Path) -> dict[str, int]:

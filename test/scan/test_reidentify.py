@@ -196,6 +196,18 @@ def test_bins_are_made_once_and_again_for_a_wider_band_or_when_the_run_has_grown
     assert [row["measurement_id"] for row in table(run / "reidentified.csv")] == ["102", "101"]
 
 
+def test_a_run_may_grow_while_its_bins_are_made(tmp_path):
+    run, band_hz = make_run(tmp_path / "run", [list(measurement(100))]), (210.0, 290.0)
+
+    def meanwhile(function, jobs):
+        (run / "recording" / "point-00001-00.mcap").write_bytes(b"")
+        return map(function, jobs)
+
+    (piece,) = kept_bins.keep_bins(run, band_hz, meanwhile).pieces
+    assert piece.read()["measurement_id"] == [100]
+    assert kept_bins.kept_bins(run, band_hz) is None  # of the run as it is now they are made anew
+
+
 def test_what_it_refuses(runs, tmp_path, capsys):
     cases = {
         "cannot be read as a run": [str(tmp_path)],
