@@ -118,7 +118,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
     OSError
         If the folder cannot be read.
     """
-    path = run / NAME
+    path, files = run / NAME, _files(run)
     if not path.is_file():
         return None
     try:
@@ -127,7 +127,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
                 return None
             content = json.loads(str(arrays["kinds"]))
         low_hz, high_hz = content["band_hz"]
-        if content["format"] != FORMAT or content["files"] != _files(run):
+        if content["format"] != FORMAT or content["files"] != files:
             return None
         kinds = [
             BinsKind(**{**kind, "harmonics": tuple(kind["harmonics"])}) for kind in content["kinds"]
@@ -142,6 +142,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         KeyError,
         TypeError,
         EOFError,
+        OSError,
         NotImplementedError,
         zipfile.BadZipFile,
         struct.error,

@@ -188,6 +188,10 @@ def test_bins_are_made_once_and_again_for_a_wider_band_or_when_the_run_has_grown
         damaged[whole.rindex(b"PK\x01\x02") + field] = 99
         (run / "bins.npz").write_bytes(damaged)
         assert made()
+    damaged = bytearray(whole)
+    damaged[-4] ^= 128  # of the place of that directory: others would lie before the file
+    (run / "bins.npz").write_bytes(damaged)
+    assert made()
     with RunDirectory.open(run) as again, again.begin_point(0) as recording:
         for k, (topic, name, message) in enumerate(measurement(102)):
             recording.write(topic, name, START_NS + k, to_cdr(message))
