@@ -21,7 +21,7 @@ from tactile_resonance.analysis import (
 )
 from tactile_resonance.calibration.model import read_calibration
 from tactile_resonance.calibration.validity import as_of_today
-from tactile_resonance.commands.options import add_band, add_figure, add_file, add_output
+from tactile_resonance.commands.options import add_band, add_figure, add_option, add_output
 from tactile_resonance.contact_analysis import ContactAnalysis, contact_content, estimate_contact
 from tactile_resonance.fields import band, require
 from tactile_resonance.files import write_whole
@@ -45,90 +45,49 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="FRF and poles of a recorded measurement",
         description="Estimate the frequency response of a periodic record and the poles of one band of it.",
     )
-    parser.add_argument(
-        "record",
-        type=Path,
-        help=".npz, .mat or .csv file, or a folder: records of the nodes, a scan's run",
-    )
-    for option, field, kind, metavar, text in _OF_RECORDS:
-        parser.add_argument(option, dest=field, type=kind, metavar=metavar, help=text)
+    text = ".npz, .mat or .csv file, or a folder: records of the nodes, a scan's run"
+    add_option(parser, "record", Path, text)
+    for option, field, kind, text in _OF_RECORDS:
+        add_option(parser, option, kind, text, dest=field)
     add_band(parser, "of a run that of its scene, else around the strongest resonance")
-    parser.add_argument(
-        "--order",
-        type=parse_order,
-        metavar="N",
-        help="of the denominator, two per mode (default: a run's own, else 2); auto or 0: the data choose one "
+    add_option(
+        parser, "--order N", parse_order,
+        "of the denominator, two per mode (default: a run's own, else 2); auto or 0: the data choose one "
         "to three modes and six to ten residual terms, by description length",
     )
-    parser.add_argument(
-        "--numerator-order",
-        type=int,
-        help="default: six real residual terms beside the modes, order + 5; 2 is the bare second-order model",
-    )
-    parser.add_argument(
-        "--domain",
-        choices=("s", "z"),
-        default="s",
-        help="of the model; z for an input held between samples (default: s)",
-    )
-    parser.add_argument(
-        "--method",
-        dest="poles_method",
-        choices=POLES_METHODS,
-        default="auto",
-        help="poles from all bins together with the transients (joint) or from the FRF (default: "
+    text = "default: six real residual terms beside the modes, order + 5; 2 is the bare second-order model"
+    add_option(parser, "--numerator-order", int, text)
+    text = "of the model; z for an input held between samples"
+    add_option(parser, "--domain", "s", text, choices=("s", "z"))
+    add_option(
+        parser, "--method", str,
+        "poles from all bins together with the transients (joint) or from the FRF (default: "
         "joint, with --channel-delay frf)",
+        dest="poles_method", choices=POLES_METHODS, default="auto",
     )
-    parser.add_argument(
-        "--frf",
-        dest="frf_method",
-        choices=METHODS,
-        default=METHODS[0],
-        help=f"how transients are dealt with (default: {METHODS[0]})",
+    text = "how transients are dealt with"
+    add_option(parser, "--frf", METHODS[0], text, dest="frf_method", choices=METHODS)
+    add_option(
+        parser, "--channel-delay S", float,
+        "of the sensor channel behind the actuator channel, from a loop-back; taken out",
+        dest="channel_delay_s", default=0.0,
     )
-    parser.add_argument(
-        "--channel-delay",
-        dest="channel_delay_s",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="of the sensor channel behind the actuator channel, from a loop-back; taken out",
-    )
-    parser.add_argument(
-        "--distortion",
-        action="store_true",
-        help="even and odd distortion at the lines left out; --plot then draws FILE_distortion too",
-    )
-    parser.add_argument(
-        "--silent",
-        action="store_true",
-        help="the record was taken without drive and needs no period: name its tones (hum) and its noise level",
-    )
-    add_file(
-        parser,
-        "--calibration",
+    text = "even and odd distortion at the lines left out; --plot then draws FILE_distortion too"
+    add_option(parser, "--distortion", False, text)
+    text = "the record was taken without drive and needs no period: name its tones (hum) and its noise level"
+    add_option(parser, "--silent", False, text)
+    add_option(
+        parser, "--calibration FILE", Path,
         "of `tactile_resonance calibrate`: stiffness of the contact, moduli and pole through this sensor; "
         "of a run without --measurement, of all its points",
     )
-    parser.add_argument(
-        "--force",
-        dest="force_n",
-        type=float,
-        metavar="N",
-        help="of the contact, with --calibration (default: a run's own; else unknown)",
-    )
-    parser.add_argument(
-        "--from-rest",
-        action="store_true",
-        help="with --calibration: the sensor was at rest at the first sample; one period is then enough",
-    )
-    parser.add_argument(
-        "--relaxed-ratio",
-        type=float,
-        metavar="X",
-        help="with --calibration: modulus at the mode over that under the held force (default: 1)",
-    )
-    add_output(parser, "--json", "write the result here")
+    text = "of the contact, with --calibration (default: a run's own; else unknown)"
+    add_option(parser, "--force N", float, text, dest="force_n")
+    text = "with --calibration: the sensor was at rest at the first sample; one period is then enough"
+    add_option(parser, "--from-rest", False, text)
+    text = "with --calibration: modulus at the mode over that under the held force (default: 1)"
+    add_option(parser, "--relaxed-ratio X", float, text)
+    add_output(parser, "--json FILE", "write the result here")
     add_figure(parser, "--plot", "draw it here")
     option_of = {each.dest: each.option_strings[0] for each in parser._actions if each.option_strings}
     parser.set_defaults(run=run, option_of=option_of)
@@ -173,29 +132,29 @@ def parse_harmonics(text: str) -> IntArray:
     return np.array(sorted(found), np.int64)
 
 
-_OF_RECORDS: tuple[tuple[str, str, Callable[[str], Any], str, str], ...] = (
-    ("--measurement", "measurement_id", int, "ID", "which one of a folder with several"),
-    ("--point", "point", int, "N", "of a run in place of --measurement: its point N, from 1"),
-    ("--u", "u", str, "FIELD", "actuator field (default: u)"),
-    ("--y", "y", str, "FIELD", "sensor field (default: y)"),
-    ("--sample-rate", "sample_rate_hz", float, "HZ", "wins over the file's"),
-    ("--samples-per-period", "samples_per_period", int, "N", "wins over the file's"),
+_OF_RECORDS: tuple[tuple[str, str, Callable[[str], Any], str], ...] = (
+    ("--measurement ID", "measurement_id", int, "which one of a folder with several"),
+    ("--point N", "point", int, "of a run in place of --measurement: its point N, from 1"),
+    ("--u FIELD", "u", str, "actuator field (default: u)"),
+    ("--y FIELD", "y", str, "sensor field (default: y)"),
+    ("--sample-rate HZ", "sample_rate_hz", float, "wins over the file's"),
+    ("--samples-per-period N", "samples_per_period", int, "wins over the file's"),
     (
-        *("--periods", "periods", int, "P"),
+        *("--periods P", "periods", int),
         "use the first P periods; where the period is not known, the record has P of them",
     ),
     (
-        *("--segments", "segments", parse_segments, "START:STOP,..."),
+        *("--segments START:STOP,...", "segments", parse_segments),
         "cut realisations out of a longer recording (samples, stop excluded); each is one period "
         "unless --samples-per-period or --periods says otherwise",
     ),
     (
-        *("--harmonics", "excited_harmonics", parse_harmonics, "H,FIRST:LAST:STEP,..."),
+        *("--harmonics H,FIRST:LAST:STEP,...", "excited_harmonics", parse_harmonics),
         "excited multiples of the sample rate over the samples per period, LAST included; "
         "default: the file's, else found from the spectrum of u",
     ),
 )
-"""Options that say what is read: each with its field of `read_record`, kind, placeholder and help."""
+"""Options that say what is read: each with its field of `read_record`, kind and help."""
 
 
 def run(options: argparse.Namespace) -> int:

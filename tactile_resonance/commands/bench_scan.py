@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_resonance import bringup
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.calibration.model import read_calibration
-from tactile_resonance.commands.options import ProgressBar, add_file, require_packages
+from tactile_resonance.commands.options import ProgressBar, add_option, require_packages
 from tactile_resonance.fields import counted, require
 from tactile_resonance.processes import (
     ENDING,
@@ -96,19 +96,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     """Options of the three commands."""
     for name, (scene, text, description) in NEW_RUNS.items():
         parser = commands.add_parser(name, help=text, description=description)
-        parser.add_argument(
-            "--scene", type=Path, help=f"scene file (default: the package's {scene})"
-        )
-        parser.add_argument(
-            "--output", type=Path, metavar="DIR", help=f"default: runs/{name}-DATE-TIME"
-        )
-        parser.add_argument("--seed", type=int, default=1, help="of phases and noise (default: 1)")
-        parser.add_argument(
-            "--notes",
-            default="",
-            metavar="YAML",
-            help="of the session, for example '{temperature_c: 21.5, tip_wetness: wet, adhesion: none}'",
-        )
+        add_option(parser, "--scene", Path, f"scene file (default: the package's {scene})")
+        add_option(parser, "--output DIR", Path, f"default: runs/{name}-DATE-TIME")
+        add_option(parser, "--seed", 1, "of phases and noise")
+        example = "{temperature_c: 21.5, tip_wetness: wet, adhesion: none}"
+        add_option(parser, "--notes YAML", "", f"of the session, for example '{example}'")
         _add_options(parser)
         parser.set_defaults(job=partial(_new_job, scene=scene, name=name))
     parser = commands.add_parser(
@@ -116,22 +108,18 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="go on with a scan that was ended or killed",
         description="Go on with the next point of a run on the simulated bench.",
     )
-    parser.add_argument("output", type=Path, metavar="RUN", help="folder of the run")
+    add_option(parser, "output RUN", Path, "folder of the run")
     _add_options(parser)
     parser.set_defaults(job=_resumed_job)
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add_robot_host(parser)
-    add_file(
-        parser,
-        "--calibration",
-        "of `tactile_resonance calibrate`: poles through this sensor where the data do not contradict it",
-    )
-    parser.add_argument(
-        "--real-time",
-        action="store_true",
-        help="on the wall clock, as with hardware: what this machine is too slow for is late, and repeated "
+    text = "of `tactile_resonance calibrate`: poles through this sensor where the data do not contradict it"
+    add_option(parser, "--calibration FILE", Path, text)
+    add_option(
+        parser, "--real-time", False,
+        "on the wall clock, as with hardware: what this machine is too slow for is late, and repeated "
         "(default: simulated time, in which a slow machine takes longer and nothing else)",
     )
     parser.set_defaults(run=lambda options: run_job(options.job(options)))
@@ -139,11 +127,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 def add_robot_host(parser: argparse.ArgumentParser) -> None:
     """The option ``--robot-host``; empty where it is not given."""
-    parser.add_argument(
-        "--robot-host",
-        default="",
-        help="127.x.y.z of the simulated robot (default: one of its own for each ROS domain)",
-    )
+    text = "127.x.y.z of the simulated robot (default: one of its own for each ROS domain)"
+    add_option(parser, "--robot-host", "", text)
 
 
 def take_domain(host: str) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_resonance.commands.options import add_option
 from tactile_resonance.files import write_whole
 
 BAND_HZ = (200.0, 300.0)  # around the mode that is fitted
@@ -43,14 +44,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "(figure 7), creep and unloading with their fits, from the simulated bench. Nothing here is a "
         "measurement.",
     )
-    parser.add_argument("name", nargs="?", choices=tuple(DRAW), help="default: all")
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("docs/figures"),
-        metavar="DIR",
-        help="default: docs/figures",
-    )
+    add_option(parser, "name", str, "default: all", nargs="?", choices=tuple(DRAW))
+    add_option(parser, "--output DIR", Path("docs/figures"))
     parser.set_defaults(run=_draw)
     parser = commands.add_parser(
         "benchmark",
@@ -58,30 +53,18 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Measure run time as a ratio to something known, and error against truth. Needs the "
         "source tree (tools/run.sh).",
     )
-    parser.add_argument("name", nargs="?", choices=NAMES, help="default: all")
-    parser.add_argument("--quick", action="store_true", help="fewer repetitions")
-    parser.add_argument(
-        "--full", action="store_true", help=f"the whole grid ({', '.join(WITH_FULL)})"
-    )
-    parser.add_argument(
-        "--part", choices=PARTS, help="renew this table of poles alone; default: all"
-    )
-    parser.add_argument(
-        "--row", metavar="TEXT", help="renew the rows of faults whose names hold this; default: all"
-    )
-    parser.add_argument(
-        "--guard",
-        action="store_true",
-        help="overview: compare what follows from seeds alone with the figures kept, write nothing, and fail "
+    add_option(parser, "name", str, "default: all", nargs="?", choices=NAMES)
+    add_option(parser, "--quick", False, "fewer repetitions")
+    add_option(parser, "--full", False, f"the whole grid ({', '.join(WITH_FULL)})")
+    add_option(parser, "--part", str, "renew this table of poles alone; default: all", choices=PARTS)
+    text = "renew the rows of faults whose names hold this; default: all"
+    add_option(parser, "--row TEXT", str, text)
+    add_option(
+        parser, "--guard", False,
+        "overview: compare what follows from seeds alone with the figures kept, write nothing, and fail "
         "where one has become worse",
     )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("docs/benchmarks"),
-        metavar="DIR",
-        help="where table and figure go (default: docs/benchmarks)",
-    )
+    add_option(parser, "--output DIR", Path("docs/benchmarks"), "where table and figure go")
     parser.set_defaults(run=_benchmark)
 
 

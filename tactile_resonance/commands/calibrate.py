@@ -7,6 +7,7 @@ import argparse
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from tactile_resonance.calibration.model import CalibratedSensor, Calibration, r
 from tactile_resonance.calibration.records import CalibrationRecord, Load
 from tactile_resonance.calibration.validity import check_in_air, poles_in_air
 from tactile_resonance.cantilever import tip_mass
-from tactile_resonance.commands.options import add_figure, add_file, add_output
+from tactile_resonance.commands.options import add_figure, add_option, add_output
 from tactile_resonance.fields import number, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.front import read_record
@@ -39,48 +40,23 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "With --check: whether a sensor is still as such a file says, from a record in air. "
         "(The table of the robot: calibrate-table.)",
     )
-    parser.add_argument(
-        "--air", type=Path, action="append", default=[], metavar="RECORD", help="tip free, in air"
-    )
-    for name, unit, text in (
-        ("mass", "KG", "a known mass at the tip"),
-        ("spring", "N_PER_M", "a known spring between tip and ground"),
-    ):
-        parser.add_argument(
-            f"--{name}",
-            nargs=2,
-            action="append",
-            default=[],
-            metavar=(unit, "RECORD"),
-            help=f"{text}; may be given several times",
-        )
-    parser.add_argument("--mass-std", type=float, default=1e-7, metavar="KG", help="default: 1e-7")
-    parser.add_argument(
-        "--spring-std", type=float, default=0.1, metavar="N_PER_M", help="default: 0.1"
-    )
-    parser.add_argument(
-        "--loopback",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="RECORD",
-        help="both channels on the generator: gain and delay between them",
-    )
-    parser.add_argument("--modes", type=int, help="default: as many as show in air")
-    parser.add_argument(
-        "--sensor",
-        default="bimorph",
-        help="of config/sensors: its ball's radius (default: bimorph)",
-    )
-    add_output(parser, "--output", "write the calibration here")
+    each: dict[str, Any] = {"action": "append", "default": []}
+    add_option(parser, "--air RECORD", Path, "tip free, in air", **each)
+    text = "may be given several times"
+    add_option(parser, "--mass KG RECORD", str, f"a known mass at the tip; {text}", **each)
+    spring = f"a known spring between tip and ground; {text}"
+    add_option(parser, "--spring N_PER_M RECORD", str, spring, **each)
+    add_option(parser, "--mass-std KG", float, "default: 1e-7", default=1e-7)
+    add_option(parser, "--spring-std N_PER_M", 0.1)
+    text = "both channels on the generator: gain and delay between them"
+    add_option(parser, "--loopback RECORD", Path, text, **each)
+    add_option(parser, "--modes", int, "default: as many as show in air")
+    add_option(parser, "--sensor", "bimorph", "of config/sensors: its ball's radius")
+    add_output(parser, "--output FILE", "write the calibration here")
     add_figure(parser, "--plot", "draw responses and residuals here")
-    add_file(parser, "--check", "compare one record in air with this calibration")
-    parser.add_argument(
-        "--simulated",
-        type=int,
-        metavar="SEED",
-        help="records of a simulated sensor that is a few percent off; compares with its truth",
-    )
+    add_option(parser, "--check FILE", Path, "compare one record in air with this calibration")
+    text = "records of a simulated sensor that is a few percent off; compares with its truth"
+    add_option(parser, "--simulated SEED", int, text)
     parser.set_defaults(run=run)
 
 

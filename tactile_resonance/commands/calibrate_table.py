@@ -19,7 +19,7 @@ from tactile_resonance.commands.bench_scan import (
     node_parameters,
     take_domain,
 )
-from tactile_resonance.commands.options import add_file, require_packages
+from tactile_resonance.commands.options import add_option, require_packages
 from tactile_resonance.fields import read
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
@@ -49,31 +49,21 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "print height and tilts with their deviations. x, y and the turn about the normal cannot be found "
         "by touch. The file is for table_in_base:= of the next launch.",
     )
-    parser.add_argument(
-        "--points",
-        metavar="YAML",
-        help="where to touch, in the table's frame [m]: '[[x, y], [x, y], [x, y]]'",
-    )
-    for name, default, text in (
-        ("height_m", 0.0, "of the touched surface above the table: a plate's thickness"),
-        ("force_n", 0.01, "that ends each touch"),
-        ("search_m", 0.0, "so far above or below its place the surface may lie"),
-        ("flatness_m", 0.0, "standard deviation of the surface about a plane"),
-        ("most_tilt_rad", 0.05, "largest tilt that is accepted"),
-        ("heading_rad", 0.0, "direction of the beam, clamp to tip, from the table's x axis"),
-    ):
-        option = f"--{name.replace('_', '-')}"
-        parser.add_argument(
-            option, type=float, default=default, help=f"{text} (default: {default:g})"
-        )
-    parser.add_argument("--sensor", default="bimorph", help="of config/sensors (default: bimorph)")
-    add_file(parser, "--output", "new file of the result, in scan_node's run_folder")
-    parser.add_argument("--namespace", default="", help="of scan_node")
-    parser.add_argument(
-        "--simulated",
-        action="store_true",
-        help="on a simulated bench of its own, whose table is 3 mm and 1 deg off; compares with that truth",
-    )
+    text = "where to touch, in the table's frame [m]: '[[x, y], [x, y], [x, y]]'"
+    add_option(parser, "--points YAML", str, text)
+    text = "of the touched surface above the table: a plate's thickness"
+    add_option(parser, "--height-m", 0.0, text)
+    add_option(parser, "--force-n", 0.01, "that ends each touch")
+    add_option(parser, "--search-m", 0.0, "so far above or below its place the surface may lie")
+    add_option(parser, "--flatness-m", 0.0, "standard deviation of the surface about a plane")
+    add_option(parser, "--most-tilt-rad", 0.05, "largest tilt that is accepted")
+    text = "direction of the beam, clamp to tip, from the table's x axis"
+    add_option(parser, "--heading-rad", 0.0, text)
+    add_option(parser, "--sensor", "bimorph", "of config/sensors")
+    add_option(parser, "--output FILE", Path, "new file of the result, in scan_node's run_folder")
+    add_option(parser, "--namespace", "", "of scan_node")
+    text = "on a simulated bench of its own, whose table is 3 mm and 1 deg off; compares with that truth"
+    add_option(parser, "--simulated", False, text)
     add_robot_host(parser)
     parser.set_defaults(run=run)
 

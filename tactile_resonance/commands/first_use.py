@@ -7,8 +7,9 @@ import argparse
 import dataclasses
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 
-from tactile_resonance.commands.options import add_file
+from tactile_resonance.commands.options import add_option
 from tactile_resonance.fields import require
 
 STEPPED = tuple(
@@ -31,11 +32,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "configuration states, watch the states for some seconds, disconnect. Nothing moves. docs/robot.md "
         "states what to set at the robot.",
     )
-    parser.add_argument(
-        "--host", help="name or address of the robot (default: the configuration's)"
-    )
-    add_file(parser, "--config", "default: config/devices/ur5e.yaml")
-    parser.add_argument("--seconds", type=float, default=5.0, help="to watch (default: 5)")
+    text = "name or address of the robot (default: the configuration's)"
+    add_option(parser, "--host", str, text)
+    add_option(parser, "--config FILE", Path, "default: config/devices/ur5e.yaml")
+    add_option(parser, "--seconds", 5.0, "to watch")
     parser.set_defaults(run=_check_robot)
     parser = commands.add_parser(
         "compile",

@@ -8,6 +8,7 @@ import os
 import signal
 import threading
 
+from tactile_resonance.commands.options import add_option, require_packages
 from tactile_resonance.fields import require
 from tactile_resonance.processes import ENDING
 
@@ -24,16 +25,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Listen to the nodes of this ROS_DOMAIN_ID and serve a page that shows what they publish: "
         "the map as it grows, force, poles and state; on 127.0.0.1 only, and to be read only. Ctrl-C ends it.",
     )
-    parser.add_argument(
-        "--port", type=int, default=PORT, help=f"default: {PORT}; 0: any that is free"
-    )
-    parser.add_argument("--namespace", default="", help="of the nodes (default: none)")
+    add_option(parser, "--port", int, f"default: {PORT}; 0: any that is free", default=PORT)
+    add_option(parser, "--namespace", "", "of the nodes (default: none)")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Listen and serve until interrupted."""
-    from tactile_resonance.commands.options import require_packages
     from tactile_resonance.report.live import LiveRun, LiveServer
 
     require_packages("rclpy", "tactile_resonance.msg")

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_figure, add_output
+from tactile_resonance.commands.options import add_figure, add_option, add_output
 from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
 from tactile_resonance.front import read_run
@@ -31,37 +31,21 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "time_s, force_n and indentation_m (.csv, .npz, .mat). Constants that a record does not determine are "
         "declared so. Of a run mechanics.csv is written anew.",
     )
-    parser.add_argument("paths", nargs="+", type=Path, metavar="RUN|FILE")
-    parser.add_argument("--terms", type=int, default=4, metavar="N", help="most terms (default: 4)")
-    parser.add_argument(
-        "--thickness-m",
-        type=float,
-        default=math.nan,
-        metavar="M",
-        help="of the tissue on what is rigid: whether Hertz's force holds",
-    )
-    add_output(parser, "--json", "write all figures")
+    add_option(parser, "paths RUN|FILE", Path, nargs="+")
+    add_option(parser, "--terms N", 4, "most terms")
+    text = "of the tissue on what is rigid: whether Hertz's force holds"
+    add_option(parser, "--thickness-m M", math.nan, text)
+    add_output(parser, "--json FILE", "write all figures")
     add_figure(parser, "--plot", "draw force and model")
     of_files = parser.add_argument_group("files only: a run knows these")
-    of_files.add_argument(
-        "--protocol",
-        choices=("relaxation", "creep", "indentation"),
-        default="relaxation",
-        help="default: relaxation",
-    )
-    of_files.add_argument("--radius-m", type=float, metavar="M", help="of the ball")
-    of_files.add_argument(
-        "--stiffness-n-per-m",
-        type=float,
-        metavar="K",
-        help="between what indentation_m was measured on and the ball; without it --rigid is needed",
-    )
-    of_files.add_argument(
-        "--rigid", action="store_true", help="the ball is held rigidly: indentation_m is its depth"
-    )
-    of_files.add_argument(
-        "--poisson-ratio", type=float, default=0.49, metavar="NU", help="default: 0.49"
-    )
+    protocols = ("relaxation", "creep", "indentation")
+    add_option(of_files, "--protocol", "relaxation", choices=protocols)
+    add_option(of_files, "--radius-m M", float, "of the ball")
+    text = "between what indentation_m was measured on and the ball; without it --rigid is needed"
+    add_option(of_files, "--stiffness-n-per-m K", float, text)
+    text = "the ball is held rigidly: indentation_m is its depth"
+    add_option(of_files, "--rigid", False, text)
+    add_option(of_files, "--poisson-ratio NU", 0.49)
     parser.set_defaults(run=run)
 
 

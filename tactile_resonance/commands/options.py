@@ -16,14 +16,44 @@ from tactile_resonance.fields import require
 FIGURES = (".png", ".pdf", ".svg")
 
 
+def add_option(
+    parser: argparse._ActionsContainer, option: str, value: Any, text: str = "", **more: Any
+) -> None:
+    """An option, or an argument, said once: as help shows it, and its default, from which its kind follows.
+
+    Parameters
+    ----------
+    parser : ArgumentParser, or a group of one
+    option : str
+        Its name and what stands for its value or values: ``"--order N"``, ``"--band LO HI"``.
+    value : object
+        The default, of the kind of the values, which help tells after the text unless it is empty or NaN. A
+        kind alone: there is none. False: an option without a value.
+    text : str
+        For help.
+    **more
+        Of ``add_argument``.
+    """
+    name, *placeholders = option.split()
+    if placeholders:
+        more["metavar"] = placeholders[0]
+    if len(placeholders) > 1:
+        more |= {"metavar": tuple(placeholders), "nargs": len(placeholders)}
+    if value is False:
+        more["action"] = "store_true"
+    elif callable(value):
+        more["type"] = value
+    else:
+        more |= {"type": type(value), "default": value}
+        if value != "" and value == value:
+            default = f"default: {value:g}" if isinstance(value, float) else f"default: {value}"
+            text = f"{text} ({default})" if text else default
+    parser.add_argument(name, help=text, **more)
+
+
 def add_runs(parser: argparse.ArgumentParser) -> None:
     """Folders of one or several runs."""
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
-
-
-def add_file(parser: argparse._ActionsContainer, option: str, text: str, **more: Any) -> None:
-    """An option that names a file."""
-    parser.add_argument(option, type=Path, help=text, **{"metavar": "FILE", **more})
+    add_option(parser, "runs RUN", Path, "folder of a run", nargs="+")
 
 
 class _Output(argparse.Action):
@@ -50,20 +80,19 @@ def add_output(
     parser: argparse._ActionsContainer, option: str, text: str, *endings: str, **more: Any
 ) -> None:
     """An option that names a file to be written, checked as the arguments are read."""
-    add_file(parser, option, text, action=_Output, endings=endings, **more)
+    add_option(parser, option, Path, text, action=_Output, endings=endings, **more)
 
 
 def add_figure(parser: argparse._ActionsContainer, option: str, text: str) -> None:
     """An option that names a figure to be written."""
     *first, last = FIGURES
-    add_output(parser, option, f"{text} ({', '.join(first)} or {last})", *FIGURES)
+    add_output(parser, f"{option} FILE", f"{text} ({', '.join(first)} or {last})", *FIGURES)
 
 
 def add_band(parser: argparse.ArgumentParser, default: str) -> None:
     """The option ``--band``; None where it is not given."""
     text = f"[Hz] of the fit; default: {default}"
-    ends = ("LO", "HI")
-    parser.add_argument("--band", dest="band_hz", type=float, nargs=2, metavar=ends, help=text)
+    add_option(parser, "--band LO HI", float, text, dest="band_hz")
 
 
 def require_packages(*packages: str) -> None:

@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_figure
+from tactile_resonance.commands.options import add_figure, add_option
 from tactile_resonance.fields import counted, read_yaml
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "and why, the touches and the time. Where the scene has regions, the simulated bench measures the "
         "first point of each as planned, and its precision and blocks are printed as expected.",
     )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file")
+    add_option(parser, "scene SCENE", Path, "scene file")
     add_figure(parser, "--figure", "draw points and lines")
     parser.set_defaults(run=run)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_resonance.commands.options import add_figure, add_file, add_output, add_runs
+from tactile_resonance.commands.options import add_figure, add_option, add_output, add_runs
 from tactile_resonance.fields import counted, require
 from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.front import read_run
@@ -56,18 +56,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "classes that follow as a file for `tissue_classes` of scenes, and try them on points left out.",
     )
     _add_runs(build)
-    add_output(build, "--output", "the library", required=True)
-    build.add_argument(
-        "--pool",
-        action="store_true",
-        help="tissues scatter alike: estimate spreads from all together (few preparations of each)",
-    )
-    build.add_argument(
-        "--leave",
-        choices=("preparation", "run"),
-        default="preparation",
-        help="what is left out of the classes that call it (default: preparation)",
-    )
+    add_output(build, "--output FILE", "the library", required=True)
+    text = "tissues scatter alike: estimate spreads from all together (few preparations of each)"
+    add_option(build, "--pool", False, text)
+    text = "what is left out of the classes that call it"
+    add_option(build, "--leave", "preparation", text, choices=("preparation", "run"))
     build.set_defaults(run=_build)
     check = kinds.add_parser(
         "check",
@@ -76,21 +69,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "probabilities hold.",
     )
     _add_runs(check)
-    add_file(
-        check, "--library", "of `references build`, or any file with tissue_classes", required=True
-    )
+    text = "of `references build`, or any file with tissue_classes"
+    add_option(check, "--library FILE", Path, text, required=True)
     check.set_defaults(run=_check)
     for each in (build, check):
-        each.add_argument(
-            "--unknown-level",
-            type=float,
-            default=0.01,
-            metavar="P",
-            help="a point farther from each class than this part of its members is unknown (default: 0.01)",
-        )
-        add_file(
-            each,
-            "--nominal",
+        text = "a point farther from each class than this part of its members is unknown"
+        add_option(each, "--unknown-level P", 0.01, text)
+        add_option(
+            each, "--nominal FILE", Path,
             "with nominal_contact, to which poles are referred (default: that of the runs' scenes; "
             "of check that of the library)",
         )
@@ -111,46 +97,29 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "discovery rate, and groups of alike points, found without references; as OUTPUT.csv and OUTPUT.png.",
     )
     add_runs(parser)
-    add_output(
-        parser, "--output", "write OUTPUT.csv and OUTPUT.png", required=True, metavar="OUTPUT"
-    )
+    add_output(parser, "--output OUTPUT", "write OUTPUT.csv and OUTPUT.png", required=True)
     spread = parser.add_mutually_exclusive_group()
-    add_file(
-        spread,
-        "--library",
+    add_option(
+        spread, "--library FILE", Path,
         "of `references build`: points of a tissue scatter as those of one preparation do there "
         "(default: by their noise alone)",
     )
-    spread.add_argument(
-        "--spread",
-        type=float,
-        nargs=2,
-        metavar=("F0_HZ", "DAMPING"),
-        help="standard deviations by which points of one tissue scatter beside their noise",
-    )
-    parser.add_argument(
-        "--rate",
-        type=float,
-        default=0.05,
-        help="part of the points said to differ that do not (default: 0.05)",
-    )
-    parser.add_argument("--most", type=int, default=6, help="groups (default: 6)")
-    add_file(
-        parser,
-        "--nominal",
-        "with nominal_contact (default: that of the library, else of the runs' scenes)",
-    )
+    text = "standard deviations by which points of one tissue scatter beside their noise"
+    add_option(spread, "--spread F0_HZ DAMPING", float, text)
+    add_option(parser, "--rate", 0.05, "part of the points said to differ that do not")
+    add_option(parser, "--most", 6, "groups")
+    text = "with nominal_contact (default: that of the library, else of the runs' scenes)"
+    add_option(parser, "--nominal FILE", Path, text)
     parser.set_defaults(run=_compare)
 
 
 def _add_runs(parser: argparse.ArgumentParser) -> None:
     add_runs(parser)
-    parser.add_argument(
-        "--labels",
-        required=True,
-        metavar="FILE",
-        help=f"CSV with tissue and at will run, index, preparation, position; or '{SCENE}': the regions of "
+    add_option(
+        parser, "--labels FILE", str,
+        f"CSV with tissue and at will run, index, preparation, position; or '{SCENE}': the regions of "
         "each run's scene, of which each is a preparation",
+        required=True,
     )
 
 

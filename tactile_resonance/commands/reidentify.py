@@ -7,7 +7,13 @@ import argparse
 import time
 from dataclasses import replace
 
-from tactile_resonance.commands.options import ProgressBar, add_band, add_output, add_runs
+from tactile_resonance.commands.options import (
+    ProgressBar,
+    add_band,
+    add_option,
+    add_output,
+    add_runs,
+)
 from tactile_resonance.fields import band, counted, require
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -22,23 +28,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "folder (bins.npz) and taken from the records once.",
     )
     add_runs(parser)
-    add_output(
-        parser,
-        "--output",
-        "write OUTPUT.csv and OUTPUT.npz (default: reidentified in the folder of the only run)",
-        metavar="OUTPUT",
-    )
+    text = "write OUTPUT.csv and OUTPUT.npz (default: reidentified in the folder of the only run)"
+    add_output(parser, "--output OUTPUT", text)
     add_band(parser, "that of each run's scene")
-    parser.add_argument(
-        "--order",
-        type=int,
-        metavar="N",
-        help="of the denominator, two per mode (default: that of each run's scene)",
-    )
-    parser.add_argument(
-        "--numerator-order",
-        type=int,
-        help="with --order; default: six residual terms beside the modes, order + 5; 2 with --order 2 is the "
+    text = "of the denominator, two per mode (default: that of each run's scene)"
+    add_option(parser, "--order N", int, text)
+    add_option(
+        parser, "--numerator-order", int,
+        "with --order; default: six residual terms beside the modes, order + 5; 2 with --order 2 is the "
         "bare second-order model",
     )
     parser.set_defaults(run=run)

@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from tactile_resonance.commands.options import add_output
+from tactile_resonance.commands.options import add_option, add_output
 from tactile_resonance.files import write_whole
 from tactile_resonance.front import read_run
 
@@ -24,18 +24,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "and boundary.json, where the scene wants a boundary. Of several runs write one page that compares the "
         "others with the first.",
     )
-    parser.add_argument(
-        "run_folders",
-        type=Path,
-        nargs="+",
-        metavar="RUN",
-        help="folder of a run; several: a comparison",
-    )
-    add_output(
-        parser,
-        "--output",
-        f"of a comparison (default: {COMPARISON}); the files of one run are in its folder",
-    )
+    text = "folder of a run; several: a comparison"
+    add_option(parser, "run_folders RUN", Path, text, nargs="+")
+    text = f"of a comparison (default: {COMPARISON}); the files of one run are in its folder"
+    add_output(parser, "--output FILE", text)
     parser.set_defaults(run=run)
 
 

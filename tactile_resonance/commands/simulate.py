@@ -11,9 +11,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_resonance.commands.options import add_file
+from tactile_resonance.commands.options import add_option
 from tactile_resonance.contact.vectors import six
 from tactile_resonance.fields import number, require
 from tactile_resonance.processes import take_priority
@@ -46,56 +47,27 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Serve RTDE (30004), dashboard (29999), scripts (30003) and a port for faults on one "
         "address, at 500 Hz, until interrupted. Nothing here is a robot.",
     )
-    parser.add_argument(
-        "--host", default="127.0.1.1", help="any 127.x.y.z, one for each robot (default: 127.0.1.1)"
-    )
-    parser.add_argument(
-        "--simulated-time",
-        action="store_true",
-        help="simulated time: it goes on only as far as the participants on port 30021 allow; without "
+    add_option(parser, "--host", "127.0.1.1", "any 127.x.y.z, one for each robot")
+    add_option(
+        parser, "--simulated-time", False,
+        "simulated time: it goes on only as far as the participants on port 30021 allow; without "
         "participants at the pace of real time (default: the wall clock)",
     )
-    parser.add_argument(
-        "--control-port", type=int, default=30020, help="for faults and queries (default: 30020)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of noise and wander (default: 0)")
-    parser.add_argument(
-        "--priority",
-        type=int,
-        default=0,
-        metavar="N",
-        help="real-time priority 1 to 99 (SCHED_FIFO; needs the right to it)",
-    )
+    add_option(parser, "--control-port", 30020, "for faults and queries")
+    add_option(parser, "--seed", 0, "of noise and wander")
+    text = "real-time priority 1 to 99 (SCHED_FIFO; needs the right to it)"
+    add_option(parser, "--priority N", int, text, default=0)
     bench = parser.add_argument_group("what the tool touches, on the robot's clock")
-    bench.add_argument(
-        "--tissue", metavar="NAME", help="of config/tissues.yaml; puts it on the table"
-    )
-    add_file(bench, "--scene", "in its place: a scene of config/scenes")
-    bench.add_argument(
-        "--table",
-        type=float,
-        nargs=6,
-        default=TABLE_IN_BASE,
-        metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
-        help="frame of the scene in the robot's base: metres and rotation vector",
-    )
-    bench.add_argument(
-        "--surface-height",
-        type=float,
-        default=0.2,
-        metavar="M",
-        help="of the tissue above the robot's base (default: 0.2)",
-    )
-    bench.add_argument("--tilt", type=float, default=0.0, metavar="DEG", help="(default: 0)")
-    bench.add_argument(
-        "--rigid-tip", action="store_true", help="the ball without the sensor's beam"
-    )
-    add_file(bench, "--cell", "load cell (default: config/load_cells/fine.yaml)")
-    bench.add_argument(
-        "--mount", choices=("table", "tool"), default="table", help="of the cell (default: table)"
-    )
-    port = CAN_PORT
-    bench.add_argument("--can-port", type=int, default=port, help=f"its socketcand port (default: {port})")
+    add_option(bench, "--tissue NAME", str, "of config/tissues.yaml; puts it on the table")
+    add_option(bench, "--scene FILE", Path, "in its place: a scene of config/scenes")
+    text = "frame of the scene in the robot's base: metres and rotation vector"
+    add_option(bench, "--table X Y Z RX RY RZ", float, text, default=TABLE_IN_BASE)
+    add_option(bench, "--surface-height M", 0.2, "of the tissue above the robot's base")
+    add_option(bench, "--tilt DEG", float, "(default: 0)", default=0.0)
+    add_option(bench, "--rigid-tip", False, "the ball without the sensor's beam")
+    add_option(bench, "--cell FILE", Path, "load cell (default: config/load_cells/fine.yaml)")
+    add_option(bench, "--mount", "table", "of the cell", choices=("table", "tool"))
+    add_option(bench, "--can-port", CAN_PORT, "its socketcand port")
     parser.set_defaults(run=_simulate_ur, default_of=parser.get_default)
     parser = commands.add_parser(
         "simulate-cell",
@@ -105,17 +77,17 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "its z axis; 'silent 1', 'stuck 1', 'lose_second_every 2', 'invalid 1', 'saturated 1', 'flipped 1', "
         "'bias_step_n 0.02' make it faulty, and 0 ends the fault.",
     )
-    parser.add_argument("--host", default="127.0.1.1", help="any 127.x.y.z (default: 127.0.1.1)")
-    parser.add_argument("--port", type=int, default=29536, help="0: a free one (default: 29536)")
-    parser.add_argument(
-        "--bus",
+    add_option(parser, "--host", "127.0.1.1", "any 127.x.y.z")
+    add_option(parser, "--port", 29536, "0: a free one")
+    add_option(
+        parser, "--bus", "socketcand",
+        "how it is served over TCP: as a socketcand with the bus can0, or as a serial adapter at "
+        "socket://HOST:PORT",
         choices=tuple(BUSES),
-        default="socketcand",
-        help="how it is served over TCP: as a socketcand with the bus can0, or as a serial adapter at "
-        "socket://HOST:PORT (default: socketcand)",
     )
-    add_file(parser, "--cell", "its scale and errors (default: config/load_cells/fine.yaml)")
-    parser.add_argument("--seed", type=int, default=1, help="of its noise (default: 1)")
+    text = "its scale and errors (default: config/load_cells/fine.yaml)"
+    add_option(parser, "--cell FILE", Path, text)
+    add_option(parser, "--seed", 1, "of its noise")
     parser.set_defaults(run=_simulate_cell)
 
 
