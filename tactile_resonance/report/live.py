@@ -17,7 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
@@ -61,32 +61,6 @@ _HEAD = (
 )
 
 
-@dataclass
-class _Measuring:
-    """What was heard of the measurement under way."""
-
-    measurement_id: int = 0
-    label: str = ""
-    frf: Any = None
-    poles: Poles | None = None
-    new: bool = False
-
-    def result(self) -> PointResult:
-        """The point as far as it is known."""
-        if self.poles is None:
-            return PointResult(0)
-        mode = self.poles.main
-        return PointResult(
-            0,
-            **mode_columns(mode.estimate, mode.covariance),
-            poles_status=self.poles.status.value,
-        )
-
-    def entry(self, force: list[tuple[float, float]]) -> dict[str, Any]:
-        """What a click on its point shows."""
-        return PointDetails(self.frf, self.poles, tuple(force)).entry(_LINES)
-
-
 class LiveRun:
     """Takes what is heard, in whatever thread, and publishes events.
 
@@ -108,7 +82,8 @@ class LiveRun:
         self._results: dict[int, PointResult] = {}
         self._details: dict[int, dict[str, Any]] = {}
         self._maps = [GrowingMap()]
-        self._measuring = _Measuring()
+        # of the measurement under way, and whether something of it is not sent yet
+        self._measuring, self._label, self._found, self._is_new = 0, "", PointDetails(), False
         self._newest: int | None = None
         self._state, self._heard_s, self._message = "", -1e9, ""
         self._forces: deque[tuple[float, float]] = deque(maxlen=_MOST_FORCES)  # not sent yet
@@ -157,13 +132,10 @@ class LiveRun:
             for k, grown in enumerate(self._maps):
                 grown.take(result.of_band(k))
             self._map_is_old = True
-            measured = self._measuring
-            if measured.measurement_id != result.measurement_id:
-                measured = _Measuring(result.measurement_id, poles=poles)
-            measured = replace(measured, poles=poles or measured.poles)
+            found = self._found if self._measuring == result.measurement_id else PointDetails()
             if result.measurement_id:
                 self._details.pop(result.index, None)
-                self._details[result.index] = measured.entry(self._contact)
+                self._details[result.index] = self._entry(found, poles)
             while len(self._details) > MOST_DETAILED:
                 del self._details[next(iter(self._details))]
             if another or wider:
@@ -175,20 +147,21 @@ class LiveRun:
 
     def take_frf(self, message: Any) -> None:
         """FRF of the measurement under way, the latest counts; of ROS or of rosbags."""
-        with self._lock:
-            now = self._of_measurement(message.measurement_id, message.label)
-            now.frf, now.new = message, True
+        self._take(message.measurement_id, message.label, frf=message)
 
     def take_poles(self, poles: Poles, measurement_id: int, label: str) -> None:
         """Poles of the measurement under way, the latest count."""
-        with self._lock:
-            now = self._of_measurement(measurement_id, label)
-            now.poles, now.new = poles, True
+        self._take(measurement_id, label, poles=poles)
 
-    def _of_measurement(self, measurement_id: int, label: str) -> _Measuring:
-        if self._measuring.measurement_id != measurement_id:
-            self._measuring = _Measuring(measurement_id, label)
-        return self._measuring
+    def _take(self, measurement_id: int, label: str, **found: Any) -> None:
+        with self._lock:
+            if self._measuring != measurement_id:
+                self._measuring, self._label, self._found = measurement_id, label, PointDetails()
+            self._found, self._is_new = replace(self._found, **found), True
+
+    def _entry(self, found: PointDetails, poles: Poles | None = None) -> dict[str, Any]:
+        """What a click on a point shows, with the force since it was held."""
+        return replace(found, poles=poles or found.poles, force=tuple(self._contact)).entry(_LINES)
 
     def take_state(self, time_s: float, state: str, force_n: float, message: str = "") -> None:
         """State of the contact at a time [s] of its clock, and its force [N]; NaN: not in contact."""
@@ -210,15 +183,14 @@ class LiveRun:
             simulated = any(r.simulated for r in self._results.values())
             counts = {"points": len(self._results), "failed": failed, "simulated": simulated}
             self._publish("now", {"text": self._text(), "forces": forces, **counts})
-            measuring = self._measuring
-            if measuring.new:
-                measuring.new = False
+            if self._is_new:
+                self._is_new = False
                 self._publish(
                     "measuring",
                     {
-                        "title": measuring.label or f"measurement {measuring.measurement_id}",
-                        "point": {**point_entry(measuring.result()), "outcome": "under way"},
-                        "detail": measuring.entry(self._contact),
+                        "title": self._label or f"measurement {self._measuring}",
+                        "point": {**point_entry(_so_far(self._found.poles)), "outcome": "under way"},
+                        "detail": self._entry(self._found),
                     },
                 )
             if self._map_is_old and self._clock_s() >= self._map_from_s:
@@ -240,6 +212,14 @@ class LiveRun:
             return "nothing is heard of contact_node"
         told = f"contact: {self._state}"
         return f"{told}; {self._message}" if self._message else told
+
+
+def _so_far(poles: Poles | None) -> PointResult:
+    """A point under way, as far as it is known."""
+    if poles is None:
+        return PointResult(0)
+    mode = mode_columns(poles.main.estimate, poles.main.covariance)
+    return PointResult(0, **mode, poles_status=poles.status.value)
 
 
 class LiveServer(ThreadingHTTPServer):
