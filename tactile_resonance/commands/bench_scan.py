@@ -221,7 +221,7 @@ def run_job(job: Job) -> int:
             return 0 if any(of.outcome is PointOutcome.DONE for of in so_far.latest) else 1
     job = replace(job, host=take_domain(job.host))
     require_own_domain()
-    ended = _Ended()
+    check_signals = _noting_signals()
     print(
         f"scan of {content.name}, simulated. To listen: ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} "
         f"ROS_AUTOMATIC_DISCOVERY_RANGE={os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}",
@@ -239,7 +239,7 @@ def run_job(job: Job) -> int:
     try:
         with NodeProcesses(work / "log") as nodes:
             nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
-            result = _scan(nodes, job, ended)
+            result = _scan(nodes, job, check_signals)
     # the nodes have ended: whether a run was begun is certain now
     except (RuntimeError, ValueError) as error:
         # a resumption that was refused would be refused again
@@ -247,7 +247,10 @@ def run_job(job: Job) -> int:
         raise ValueError(f"{error} (logs in {work / 'log'}){way_on}") from error
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(_way_on(job)) from error
-    ended.at_once()  # every file of a report is whole or not there
+    # no node runs that would have to be ended first, and every file of a report is whole or not there
+    for number in ENDING:
+        signal.signal(number, signal.default_int_handler)
+    check_signals()
     if result.ending is Ending.COMPLETE:  # each simulated record that counts is in the run
         shutil.rmtree(work / "records", ignore_errors=True)
     try:
@@ -289,30 +292,20 @@ def require_own_domain() -> None:
             )
 
 
-class _Ended:
-    """Notes `ENDING` signals, so that they take effect only where `check` is called: they end nodes in order.
+def _noting_signals() -> Callable[[], None]:
+    """From now on `ENDING` signals take effect only where what is returned is called: they end nodes in order.
 
-    Even where a shell made this process ignore Ctrl-C.
+    Even where a shell made this process ignore Ctrl-C. What is returned raises `KeyboardInterrupt` if one has come.
     """
+    come: list[int] = []
+    for number in ENDING:
+        signal.signal(number, lambda number, _: come.append(number))
 
-    def __init__(self) -> None:
-        self._asked = False
-        for number in ENDING:
-            signal.signal(number, self._note)
-
-    def check(self) -> None:
-        """Raise `KeyboardInterrupt` if a signal has come."""
-        if self._asked:
+    def check() -> None:
+        if come:
             raise KeyboardInterrupt
 
-    def at_once(self) -> None:
-        """From now on a signal takes effect as it comes: no node runs that would have to be ended first."""
-        for number in ENDING:
-            signal.signal(number, signal.default_int_handler)
-        self.check()
-
-    def _note(self, *_: object) -> None:
-        self._asked = True
+    return check
 
 
 def node_parameters(
@@ -338,7 +331,7 @@ def node_parameters(
     return nodes
 
 
-def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
+def _scan(nodes: NodeProcesses, job: Job, check_signals: Callable[[], None]) -> ScanOutcome:
     # only here: the command answers --help, and reports what is missing, without ROS
     from tactile_resonance.client import Ending
     from tactile_resonance.nodes.client import ScanClient
@@ -350,7 +343,7 @@ def _scan(nodes: NodeProcesses, job: Job, ended: _Ended) -> ScanOutcome:
     silence = Silence()
 
     def check() -> None:
-        ended.check()
+        check_signals()
         nodes.check()
         if up and silence.lasts_s(client.reports["scan_node"]) > HUNG_AFTER_S:
             raise RuntimeError(f"scan_node hangs: it is silent for {HUNG_AFTER_S:g} s")
