@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command itself: its version, and what it says before it compiles."""
 
+import argparse
+import math
 import os
 import subprocess
 import sys
@@ -10,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tactile_resonance import cli
+from tactile_resonance.commands.options import add_option
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -19,6 +22,30 @@ def test_version_is_that_of_the_package(capsys):
         cli.main(["--version"])
     version = ElementTree.parse(ROOT / "package.xml").findtext("version")
     assert capsys.readouterr().out == f"tactile_resonance {version}\n"
+
+
+def test_an_option_has_the_kind_of_its_default_which_help_tells():
+    parser = argparse.ArgumentParser()
+    add_option(parser, "--level P", 0.01, "of a test")
+    add_option(parser, "--most", 6)
+    add_option(parser, "--thickness-m M", math.nan, "of a layer")
+    add_option(parser, "--namespace", "", "of the nodes")
+    add_option(parser, "--band LO HI", float, "[Hz]", dest="band_hz")
+    add_option(parser, "--rigid", False)
+    options = parser.parse_args([])
+    assert (options.level, options.most, options.namespace, options.band_hz) == (0.01, 6, "", None)
+    assert math.isnan(options.thickness_m)
+    assert options.rigid is False
+    options = parser.parse_args("--level 1 --most 2 --band 200 300 --rigid".split())
+    assert (options.level, options.most, options.band_hz) == (1.0, 2, [200.0, 300.0])
+    assert type(options.level) is float
+    assert options.rigid is True
+    told = [" ".join(line.split()) for line in parser.format_help().splitlines()]
+    for line in (
+        *("--level P of a test (default: 0.01)", "--most MOST default: 6", "--band LO HI [Hz]"),
+        *("--thickness-m M of a layer", "--namespace NAMESPACE", "of the nodes", "--rigid"),
+    ):
+        assert line in told
 
 
 @pytest.mark.parametrize(
