@@ -36,7 +36,7 @@ def test_an_option_has_the_kind_of_its_default_which_help_tells():
     assert (options.level, options.most, options.namespace, options.band_hz) == (0.01, 6, "", None)
     assert math.isnan(options.thickness_m)
     assert options.rigid is False
-    options = parser.parse_args("--level 1 --most 2 --band 200 300 --rigid".split())
+    options = parser.parse_args(["--level", "1", "--most", "2", "--band", "200", "300", "--rigid"])
     assert (options.level, options.most, options.band_hz) == (1.0, 2, [200.0, 300.0])
     assert type(options.level) is float
     assert options.rigid is True

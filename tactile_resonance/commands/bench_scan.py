@@ -295,7 +295,8 @@ def require_own_domain() -> None:
 def _noting_signals() -> Callable[[], None]:
     """From now on `ENDING` signals take effect only where what is returned is called: they end nodes in order.
 
-    Even where a shell made this process ignore Ctrl-C. What is returned raises `KeyboardInterrupt` if one has come.
+    Even where a shell made this process ignore Ctrl-C. What is returned raises `KeyboardInterrupt` if one has
+    come.
     """
     come: list[int] = []
     for number in ENDING:
