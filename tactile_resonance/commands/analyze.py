@@ -90,7 +90,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add_output(parser, "--json FILE", "write the result here")
     add_figure(parser, "--plot", "draw it here")
     option_of = {each.dest: each.option_strings[0] for each in parser._actions if each.option_strings}
-    parser.set_defaults(run=run, option_of=option_of)
+    default_of = {name: parser.get_default(name) for name in option_of}
+    parser.set_defaults(run=run, option_of=option_of, default_of=default_of)
 
 
 def parse_order(text: str) -> int:
@@ -156,6 +157,12 @@ _OF_RECORDS: tuple[tuple[str, str, Callable[[str], Any], str], ...] = (
 )
 """Options that say what is read: each with its field of `read_record`, kind and help."""
 
+_OF_POLES = (
+    *("order", "numerator_order", "domain", "poles_method", "frf_method", "channel_delay_s"),
+    *("distortion", "plot"),
+)
+_OF_CONTACTS = ("force_n", "from_rest", "relaxed_ratio")
+
 
 def run(options: argparse.Namespace) -> int:
     """Read, analyse, then write; a message that begins with a field also names the option for it."""
@@ -171,6 +178,7 @@ def run(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     """Nothing is written unless all went well."""
     _check_outputs(options)
+    _check_together(options)
     if options.point is not None:
         if options.measurement_id is not None:
             raise ValueError("point: given beside --measurement, expected one of them")
@@ -181,17 +189,10 @@ def _run(options: argparse.Namespace) -> int:
         options.measurement_id = measurement_at(options.record, options.point)
     if options.calibration is not None:
         return _analyze_contacts(options)
-    for name in ("force_n", "from_rest", "relaxed_ratio"):
-        value = getattr(options, name)
-        good = value in (None, False)
-        require(good, options.option_of[name], value, "one beside --calibration")
     recording = _recording(options, options.measurement_id)
     rate_hz = recording.sample_rate_hz
     band_hz = None if options.band_hz is None else band(options.band_hz, most_hz=rate_hz / 2)
     if options.silent:
-        for name in ("json", "plot"):
-            if getattr(options, name) is not None:
-                raise ValueError(f"--{name}: not with --silent, which prints")
         check_undriven(recording.u, recording.excited_harmonics, rate_hz)
         found = silent_record(recording.u, recording.y, sample_rate_hz=rate_hz, band_hz=band_hz)
         print(found.text())
@@ -289,11 +290,21 @@ def _check_outputs(options: argparse.Namespace) -> None:
     require(not same, "--json, --plot", str(options.json), "two files")
 
 
+def _check_together(options: argparse.Namespace) -> None:
+    """Refuse options that would be passed over."""
+    unused, accepted = _OF_CONTACTS, "one beside --calibration"
+    if options.calibration is not None:
+        unused, accepted = (*_OF_POLES, "silent"), "one without --calibration"
+    elif options.silent:
+        unused, accepted = (*_OF_POLES, *_OF_CONTACTS, "json"), "one without --silent, which prints"
+    for name in unused:
+        value = getattr(options, name)
+        text = str(value) if isinstance(value, Path) else value
+        require(value == options.default_of[name], options.option_of[name], text, accepted)
+
+
 def _analyze_contacts(options: argparse.Namespace) -> int:
     """Contact of one record, or of each point of a run."""
-    for name in ("plot", "silent", "distortion"):
-        if getattr(options, name):
-            raise ValueError(f"--{name}: not with --calibration")
     sensor = read_calibration(options.calibration)
     run = read_run(options.record) if (options.record / "run.json").is_file() else None
     if run is not None:
