@@ -221,7 +221,7 @@ def run_job(job: Job) -> int:
             return 0 if any(of.outcome is PointOutcome.DONE for of in so_far.latest) else 1
     job = replace(job, host=take_domain(job.host))
     require_own_domain()
-    check_signals = _noting_signals()
+    check_signals = noting_signals()
     print(
         f"scan of {content.name}, simulated. To listen: ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} "
         f"ROS_AUTOMATIC_DISCOVERY_RANGE={os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}",
@@ -292,7 +292,7 @@ def require_own_domain() -> None:
             )
 
 
-def _noting_signals() -> Callable[[], None]:
+def noting_signals() -> Callable[[], None]:
     """From now on `ENDING` signals take effect only where what is returned is called: they end nodes in order.
 
     Even where a shell made this process ignore Ctrl-C. What is returned raises `KeyboardInterrupt` if one has

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from tactile_resonance.commands.bench_scan import (
     Job,
     add_robot_host,
     node_parameters,
+    noting_signals,
     take_domain,
 )
 from tactile_resonance.commands.options import add_option, require_packages
@@ -100,10 +101,10 @@ def ask(
     xys: Sequence[Sequence[float]],
     height_m: float,
     wanted: dict[str, Any],
-    nodes: NodeProcesses | None = None,
+    check_nodes: Callable[[], None] | None = None,
     namespace: str = "",
 ) -> CalibrationOutcome:
-    """Outcome of a calibration by a scan_node that runs, or by the nodes that were started."""
+    """Outcome of a calibration by a scan_node that runs, or by nodes that were started and are checked."""
     require_packages("rclpy", "tactile_resonance.msg")
     # only here: the command answers --help without ROS
     from geometry_msgs.msg import Point
@@ -124,8 +125,8 @@ def ask(
         )
 
     points = [Point(x=x, y=y, z=height_m) for x, y in xys]
-    with ScanClient(nodes.check if nodes else lambda: None, namespace=namespace) as client:
-        if nodes is not None:
+    with ScanClient(check_nodes or (lambda: None), namespace=namespace) as client:
+        if check_nodes is not None:
             client.wait_until_up(START_WITHIN_S)
         outcome = client.calibrate_table(
             WITHIN_S, points=points, **wanted, on_feedback=tell, wait_s=NODE_WITHIN_S
@@ -148,10 +149,16 @@ def _simulated(
     if wanted["file"]:
         wanted["file"] = Path(wanted["file"]).absolute()
         parameters["scan_node"]["goal_folders"] = [str(wanted["file"].parent)]
+    check_signals = noting_signals()
     with NodeProcesses(work / "log") as nodes:
+
+        def check() -> None:
+            check_signals()
+            nodes.check()
+
         nodes.bring_up(NODES, parameters)
         try:
-            return ask(xys, height_m, wanted, nodes)
+            return ask(xys, height_m, wanted, check)
         except RuntimeError as error:  # a node ended, or did not come up
             raise ValueError(str(error)) from error
 
