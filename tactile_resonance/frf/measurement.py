@@ -31,8 +31,8 @@ MOST_BINS = 20000
 class MeasurementFrf:
     """Takes in the records of one measurement; after each, the FRF so far.
 
-    The record of the realisation so far is kept, and transformed again with every block: what comes of
-    it is what the whole record at once gives.
+    The record of the realisation so far is kept, and transformed again with every block from which on it is as
+    long as the ones before: what comes of it is what the whole record at once gives.
 
     Parameters
     ----------
@@ -65,12 +65,10 @@ class MeasurementFrf:
         self._lines: IntArray = np.empty(0, np.int64)
         self._lines_of_bands: list[IntArray] = []  # where others between them show distortion
         self._samples: FloatArray = np.empty((2, 0, 0))  # (2, room, N), rows [y; u]
-        # of each realisation; bins and lines that show distortion in each band
-        self._spectra: dict[
-            int, tuple[PeriodicSpectra, list[BandBins], list[PeriodicSpectra]]
-        ] = {}
         self._periods: dict[int, int] = {}
-        self._frf: FRF | None = None
+        # of each realisation that counts; bins and lines that show distortion in each band
+        self._parts: dict[int, tuple[PeriodicSpectra, list[BandBins], list[PeriodicSpectra]]] = {}
+        self._frf = FRF(np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED)
         self._notes: list[str] = []
         self._faults = FaultReport()  # the worst of each kind that a single block shows
         self._first: Record | None = None
@@ -144,10 +142,7 @@ class MeasurementFrf:
         A delay of the sensor channel that the record states is taken out; bins, which hold the
         transient too, then do not come along.
         """
-        frf = self._frf
-        if frf is None:
-            frf = FRF(np.empty(0), np.empty(0, complex), status=FrfStatus.FAILED)
-        frf = replace(frf, bands=self._bands)
+        frf = replace(self._frf, bands=self._bands)
         delay_s = float("nan") if self._last is None else self._last.channel_delay_s
         if frf.g.size and np.isfinite(delay_s) and delay_s != 0:
             frf = correct_skew(replace(frf, bins=None, further_bins=()), delay_s)
@@ -204,6 +199,9 @@ class MeasurementFrf:
                 f"{self._samples.shape[1]} are accepted, those of the excitation"
             )
         self._samples[:, so_far:periods] = record.samples
+        self._periods[realisation] = periods
+        if periods < max(self._periods.values()):
+            return  # it counts once it is as long as the others
         if so_far:
             record = Spectrum(self._samples[:, :periods])
         spectra = mean_spectra(record, self._lines, order=self._order, dof=self._dof)
@@ -219,17 +217,13 @@ class MeasurementFrf:
         detection = [
             spectra_between(record, lines, harmonics) for lines in self._lines_of_bands
         ]
-        self._spectra[realisation] = spectra, bins, detection
-        self._periods[realisation] = periods
-        if periods < max(self._periods.values()):
-            return  # it counts once it is as long as the others
+        self._parts[realisation] = spectra, bins, detection
         # with one that lost blocks all others would count as equally short
-        whole = [number for number in self._spectra if self._periods[number] == periods]
-        for number in self._spectra.keys() - whole:
-            self._note(f"realisation {number + 1}: left out, shorter than the others")
-        each, bins_of_each, detection_of_each = zip(
-            *(self._spectra[number] for number in whole), strict=True
-        )
+        for number, count in self._periods.items():
+            if 0 < count < periods:
+                self._note(f"realisation {number + 1}: left out, shorter than the others")
+        whole = [part for part in self._parts.values() if part[0].periods == periods]
+        each, bins_of_each, detection_of_each = zip(*whole, strict=True)
         frf = frf_of_realisations(stacked_spectra(each), sample_rate_hz=rate_hz)
         stacked = tuple(stacked_bins(of) for of in zip(*bins_of_each, strict=True))
         if any(of.u.size > MOST_BINS for of in stacked):
