@@ -8,14 +8,12 @@ without the sensor, or beside the wrong actuator signal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 from scipy import special
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.frf.spectra import (
     PeriodicSpectra,
@@ -45,6 +43,10 @@ DEVIATIONS = 5.0
 FOR_GAIN, ALIKE = 0.8, 0.5
 ABOVE_NOISE = 10.0
 """What realisations differ by, over the power of the noise, from which noise is no reason for it."""
+UNLIKE = (
+    "the responses of the realisations have nothing in common, which noise does not explain: "
+    "actuator and sensor are of different records, or distortion is larger than the response"
+)
 # Lines over which neighbours are compared: a transient is at the modes.
 WINDOWS = (8, 32, 128)
 
@@ -246,120 +248,102 @@ def _contradiction(
             "record two periods or more of each, or wait before the record"
         )
     g_each, u = (x.reshape(-1, *g_each.shape[-2:]) for x in (g_each, each[..., 1, :]))
-    return next(filter(None, Agreement.of(g_each, u, differ).remarks()), "")
+    return next(filter(None, disagreement(g_each, u, differ)[0]), "")
 
 
-@dataclass(frozen=True, eq=False)
-class Agreement:
-    """How realisations compare with each other.
+def disagreement(
+    response: ComplexArray, u: ComplexArray, differ: FloatArray | None = None
+) -> tuple[npt.NDArray[np.object_], BoolArray]:
+    """Why the responses of realisations are not of one system.
 
-    Attributes
+    Parameters
     ----------
-    gain : (batch, M, M) complex
-        ``gain[m, n]``: response of m in units of that of n; 1 where they agree.
-    pairs : (batch, M, M) bool
-        Coherent, but of another phase or gain.
-    apart : (batch, M) bool
-        Without coherence with any other realisation, two of which are coherent.
-    unlike : (batch,) bool
-        None coherent with any other, and noise is no reason for it.
+    response : (batch, M, F) complex
+        Of each realisation; lines without input, NaN, count as none.
+    u : (batch or 1, M, F) complex
+        Inputs: a line that is hardly driven shows noise.
+    differ : (batch,) float, optional
+        Power of what realisations differ by over that of the noise, where that is known.
+
+    Returns
+    -------
+    remarks : (batch,) str
+        What contradicts, for people; empty where nothing does.
     of_no_system : (batch,) bool
-        Unlike, or of another phase: the mean of the responses says nothing.
+        None is coherent with any other, for which noise is no reason, or one is of another phase: the mean of
+        the responses says nothing.
+
+    Notes
+    -----
+    Noise and stochastic distortion of two realisations are independent, so that they lower the
+    coherence ``|H_mn|^2 / (H_mm H_nn)``, ``H_mn = sum G_m conj G_n``, but turn no phase.
     """
+    drive = np.sqrt(power(u).mean(axis=1, keepdims=True))
+    response = np.where(np.isfinite(response), response * drive, 0)
+    size = power(response).sum(axis=1)  # (batch, F)
+    few = min(LINES_ALIKE, size.shape[-1])
+    weight = 1 / np.maximum(size + np.partition(size, -few, axis=-1)[:, [-few]], np.finfo(float).tiny)
+    share = weight * size
+    lines = np.sum(share, axis=-1) ** 2 / np.maximum(np.sum(share**2, axis=-1), np.finfo(float).tiny)
+    lines = np.maximum(lines, 2.0)[:, None, None]
+    h = (response * weight[:, None]) @ response.conj().swapaxes(1, 2)  # (batch, M, M)
+    diagonal = np.einsum("bmm->bm", h).real
+    diagonal = np.where(diagonal > 0, diagonal, np.nan)
+    coherence = power(h) / (diagonal[:, :, None] * diagonal[:, None, :])
+    records = response.shape[1]
+    tests = max(records * (records - 1) // 2, 1)
+    coherent = coherence > 1 - (FALSE_ALARM / tests) ** (1 / (lines - 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        deviation = np.sqrt((1 - np.minimum(coherence, 1)) / (2 * lines * coherence))
+        gain = h / np.abs(h) * np.sqrt(diagonal[:, :, None] / diagonal[:, None, :])
+    opposed = coherent & (np.abs(np.angle(h)) > MOST_PHASE_RAD + DEVIATIONS * deviation)
+    high = coherent & (coherence > FOR_GAIN)
+    unequal = high & (np.abs(np.log(np.abs(gain))) > np.log(MOST_GAIN) + DEVIATIONS * deviation)
+    unlike = np.zeros(len(h), bool)
+    if differ is not None:
+        others = ~np.eye(records, dtype=bool)
+        mean = np.mean(coherence, axis=(1, 2), where=others)
+        spread = (1 - ALIKE) * np.sqrt(2 * ALIKE / (lines[:, 0, 0] * max(records - 1, 1)))
+        low = (mean < ALIKE - 3 * spread) & ~(coherent & others).any(axis=(1, 2))
+        unlike = low & (differ > ABOVE_NOISE)
+    pairs, apart = opposed | unequal, _apart(h, coherence, coherent, lines)
+    remarks = np.full(len(h), "", object)
+    for k in np.flatnonzero(pairs.any(axis=(1, 2)) | apart.any(axis=-1) | unlike):
+        remarks[k] = UNLIKE if unlike[k] else _odd_one(gain[k], pairs[k], np.flatnonzero(apart[k]))
+    return remarks, opposed.any(axis=(1, 2)) | unlike
 
-    gain: ComplexArray
-    pairs: BoolArray
-    apart: BoolArray
-    unlike: BoolArray
-    of_no_system: BoolArray
 
-    @classmethod
-    def of(
-        cls, response: ComplexArray, u: ComplexArray, differ: FloatArray | None = None
-    ) -> Agreement:
-        """Of responses.
+def _odd_one(gain: ComplexArray, pairs: BoolArray, apart: IntArray) -> str:
+    """Which realisation differs, for people.
 
-        Parameters
-        ----------
-        response : (batch, M, F) complex
-            Of each realisation; lines without input, NaN, count as none.
-        u : (batch or 1, M, F) complex
-            Inputs: a line that is hardly driven shows noise.
-        differ : (batch,) float, optional
-            Power of what realisations differ by over that of the noise, where that is known.
-
-        Notes
-        -----
-        Noise and stochastic distortion of two realisations are independent, so that they lower the
-        coherence ``|H_mn|^2 / (H_mm H_nn)``, ``H_mn = sum G_m conj G_n``, but turn no phase.
-        """
-        drive = np.sqrt(power(u).mean(axis=1, keepdims=True))
-        response = np.where(np.isfinite(response), response * drive, 0)
-        size = power(response).sum(axis=1)  # (batch, F)
-        few = min(LINES_ALIKE, size.shape[-1])
-        weight = 1 / np.maximum(size + np.partition(size, -few, axis=-1)[:, [-few]], np.finfo(float).tiny)
-        share = weight * size
-        lines = np.sum(share, axis=-1) ** 2 / np.maximum(np.sum(share**2, axis=-1), np.finfo(float).tiny)
-        lines = np.maximum(lines, 2.0)[:, None, None]
-        h = (response * weight[:, None]) @ response.conj().swapaxes(1, 2)  # (batch, M, M)
-        diagonal = np.einsum("bmm->bm", h).real
-        diagonal = np.where(diagonal > 0, diagonal, np.nan)
-        coherence = power(h) / (diagonal[:, :, None] * diagonal[:, None, :])
-        records = response.shape[1]
-        pairs = max(records * (records - 1) // 2, 1)
-        coherent = coherence > 1 - (FALSE_ALARM / pairs) ** (1 / (lines - 1))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            deviation = np.sqrt((1 - np.minimum(coherence, 1)) / (2 * lines * coherence))
-            gain = h / np.abs(h) * np.sqrt(diagonal[:, :, None] / diagonal[:, None, :])
-        opposed = coherent & (np.abs(np.angle(h)) > MOST_PHASE_RAD + DEVIATIONS * deviation)
-        high = coherent & (coherence > FOR_GAIN)
-        unequal = high & (np.abs(np.log(np.abs(gain))) > np.log(MOST_GAIN) + DEVIATIONS * deviation)
-        unlike = np.zeros(len(h), bool)
-        if differ is not None:
-            others = ~np.eye(records, dtype=bool)
-            mean = np.mean(coherence, axis=(1, 2), where=others)
-            spread = (1 - ALIKE) * np.sqrt(2 * ALIKE / (lines[:, 0, 0] * max(records - 1, 1)))
-            low = (mean < ALIKE - 3 * spread) & ~(coherent & others).any(axis=(1, 2))
-            unlike = low & (differ > ABOVE_NOISE)
-        apart = _apart(h, coherence, coherent, lines)
-        return cls(gain, opposed | unequal, apart, unlike, opposed.any(axis=(1, 2)) | unlike)
-
-    @property
-    def contradiction(self) -> BoolArray:
-        """(batch,) whether the records are not of one system."""
-        return np.asarray(self.pairs.any(axis=(1, 2)) | self.apart.any(axis=-1) | self.unlike)
-
-    def remarks(self) -> npt.NDArray[np.object_]:
-        """(batch,) what contradicts, for people; empty where nothing does."""
-        wrong = self.contradiction
-        remarks = np.full(wrong.size, "", object)
-        for k in np.flatnonzero(wrong):
-            remarks[k] = self._remark(int(k))
-        return remarks
-
-    def _remark(self, k: int) -> str:
-        if self.unlike[k]:
-            return (
-                "the responses of the realisations have nothing in common, which noise does not explain: "
-                "actuator and sensor are of different records, or distortion is larger than the response"
-            )
-        pairs, apart = self.pairs[k], np.flatnonzero(self.apart[k])
-        records = np.arange(len(pairs))
-        if apart.size:
-            names = " and ".join(str(m + 1) for m in apart)
-            return f"the response of realisation {names} has nothing in common with those of the others"
-        for m in records if records.size > 2 else ():
-            rest = records[records != m]
-            if not pairs[np.ix_(rest, rest)].any():
-                return _difference(int(m), self.gain[k, m, rest].mean(), "the others")
-        m, n = np.argwhere(pairs)[0].tolist()
-        return _difference(n, self.gain[k, n, m], f"realisation {m + 1}")
+    Parameters
+    ----------
+    gain : (M, M) complex
+        ``gain[m, n]``: response of m in units of that of n; 1 where they agree.
+    pairs : (M, M) bool
+        Coherent, but of another phase or gain.
+    apart : (k,) int
+        Those of `_apart`.
+    """
+    if apart.size:
+        names = " and ".join(str(m + 1) for m in apart)
+        return f"the response of realisation {names} has nothing in common with those of the others"
+    records = np.arange(len(pairs))
+    for m in records if records.size > 2 else ():
+        rest = records[records != m]
+        if not pairs[np.ix_(rest, rest)].any():
+            return _difference(int(m), gain[m, rest].mean(), "the others")
+    m, n = np.argwhere(pairs)[0].tolist()
+    return _difference(n, gain[n, m], f"realisation {m + 1}")
 
 
 def _apart(
     h: ComplexArray, coherence: FloatArray, coherent: BoolArray, lines: FloatArray
 ) -> BoolArray:
-    """(batch, M) see `Agreement`: with neither of the two that are most alike, beyond what noise may hide."""
+    """(batch, M) without coherence with any other, two of which are coherent.
+
+    It lacks what the two that are most alike have in common, by more than noise may hide.
+    """
     batch, records, _ = h.shape
     others = coherent & ~np.eye(records, dtype=bool)
     alike = np.where(others, coherence, 0.0).reshape(batch, records**2)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.frf.estimate import Agreement
+from tactile_resonance.frf.estimate import disagreement
 from tactile_resonance.poles.data import BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
@@ -451,10 +451,11 @@ def _each_by_itself(fit: Judged, total: FloatArray, first: _Round) -> Judged:
     odd, remark = spread.remarks()
     wrong = np.zeros(odd.size, bool)
     for response in first.responses:
-        agreement = Agreement.of(response, first.data.u_driven, levels.excited / levels.between)
-        remark = np.where(agreement.contradiction, agreement.remarks(), remark)
-        wrong |= agreement.contradiction
-        unknown = agreement.of_no_system[:, None, None]
+        differ = levels.excited / levels.between
+        remarks, of_no_system = disagreement(response, first.data.u_driven, differ)
+        remark = np.where(remarks != "", remarks, remark)
+        wrong |= remarks != ""
+        unknown = of_no_system[:, None, None]
         if np.any(unknown):  # what is left of their mean is of no system
             covariance, total = (np.where(unknown, np.nan, one) for one in (covariance, total))
     return replace(
