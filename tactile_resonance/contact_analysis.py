@@ -118,6 +118,7 @@ def estimate_contact(
     require(from_rest or periods > 1, "periods", periods, accepted)
     if np.isfinite(force_n):
         require(number(force_n, "force_n") > 0, "force_n", force_n, "above 0")
+        require(number(force_std_n, "force_std_n") >= 0, "force_std_n", force_std_n, "0 or above")
     ratio = number(relaxed_ratio, "relaxed_ratio")
     require(ratio > 0, "relaxed_ratio", ratio, "above 0")
     rate_hz = recording.sample_rate_hz

@@ -61,6 +61,9 @@ def test_one_period_needs_a_known_start(bench, library, sensor_file):
     known = {"band_hz": BAND_HZ, "from_rest": True}
     with pytest.raises(ValueError, match="law: got 'Hooke'; accepted is one of .*power law"):
         tr.estimate_contact(recording, sensor_file, **known, law="Hooke")
+    for std, accepted in ((np.nan, "a finite number"), (-1e-4, "0 or above")):
+        with pytest.raises(ValueError, match=f"force_std_n: got {std}; accepted is {accepted}"):
+            tr.estimate_contact(recording, sensor_file, **known, force_n=FORCE_N, force_std_n=std)
     by_name = tr.estimate_contact(recording, sensor_file, **known, law="power law")
     assert by_name.contact.prior.law is Law.POWER_LAW
 
