@@ -138,6 +138,16 @@ def test_a_bad_block_is_not_taken(channels):
     assert frf.status is FrfStatus.SUSPECT  # the sensor had missing samples
 
 
+def test_a_record_too_short_for_the_noise_wanted_counts_once_it_is_longer(channels):
+    u, y = channels
+    measurement = MeasurementFrf(1, dof=120)
+    measurement.add(record(u[0, 0], y[0, 0], 0, 0), excitation(0))
+    with pytest.raises(ValueError, match="order, dof: 2, 120 need 124 bins between harmonics"):
+        measurement.add(record(u[0, 1], y[0, 1], 0, 1), excitation(0))
+    frf = measurement.add(record(u[0, 2], y[0, 2], 0, 2), excitation(0))
+    assert (frf.periods, frf.status, frf.message) == (3, FrfStatus.OK, "")
+
+
 def test_what_is_too_much_is_refused(channels):
     u, y = channels
     measurement = MeasurementFrf(1)
