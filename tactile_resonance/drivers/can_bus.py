@@ -11,6 +11,7 @@ import time
 from binascii import Error as HexError
 from binascii import unhexlify
 from collections import deque
+from concurrent.futures import Future, wait
 from typing import Any, NamedTuple
 
 import can
@@ -276,29 +277,19 @@ def open_bus(
 
 def _opened(settings: dict[str, Any]) -> can.BusABC:
     """A bus of python-can; `TimeoutError` where it is not open in time, and then let go once it is."""
-    opened: list[can.BusABC] = []
-    failed: list[Exception] = []
-    given_up = threading.Event()
+    opening: Future[can.BusABC] = Future()
 
     def open_it() -> None:
         try:
-            bus = can.Bus(**settings)
+            opening.set_result(can.Bus(**settings))
         except Exception as error:
-            failed.append(error)
-            return
-        opened.append(bus)
-        if given_up.is_set():
-            bus.shutdown()
+            opening.set_exception(error)
 
-    opener = threading.Thread(target=open_it, name="can_open", daemon=True)
-    opener.start()
-    opener.join(OPEN_WITHIN_S)
-    if failed:
-        raise failed[0]
-    if not opened:
-        given_up.set()
+    threading.Thread(target=open_it, name="can_open", daemon=True).start()
+    if wait([opening], OPEN_WITHIN_S).not_done:
+        opening.add_done_callback(lambda late: late.exception() or late.result().shutdown())
         raise TimeoutError(LATE)
-    return opened[0]
+    return opening.result()
 
 
 class Flow:
