@@ -23,11 +23,10 @@ from tactile_resonance.contact.interfaces import (
     ForceError,
     ForceFault,
     ForceInfo,
-    Mount,
     NodeArm,
 )
-from tactile_resonance.contact.payload import Mounting, Payload, TipForce
-from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
+from tactile_resonance.contact.payload import Mounting, TipForce
+from tactile_resonance.contact.samples import ArmSample, CellSample
 from tactile_resonance.contact.vectors import Six, rotated_back, turn_from_vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
 from tactile_resonance.fields import (
@@ -62,8 +61,8 @@ def _read_bus(value: object, where: str) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForceConfig:
-    """A force source: what its file in ``config/force`` states, whatever its kind.
+class ForceConfig(Mounting):
+    """A force source: what its file in ``config/force`` states, whatever its kind, and where it sits.
 
     Attributes
     ----------
@@ -74,14 +73,9 @@ class ForceConfig:
         Of one sample, white, on each axis [N].
     range_n, range_nm : float
         Largest force and torque of each axis [N], [N m].
-    mount : Mount
-    frame : Pose
-        Of the cell: in the robot's base under the sample, in the frame `tip` on the tool.
     name : str
     latency_s : float
         From the force to the time stamp, filters of the sensor included [s].
-    payload : Payload or None
-        What a cell on the tool carries.
     limits : CellLimits
     resolution_n : float or None
         Smallest step [N]; None: a count of a cell on CAN.
@@ -92,15 +86,13 @@ class ForceConfig:
     noise_rms_n: float
     range_n: float
     range_nm: float
-    mount: Mount
-    frame: Pose
     name: str = ""
     latency_s: float = 0.0
-    payload: Payload | None = None
     limits: CellLimits = field(default_factory=CellLimits)
     resolution_n: float | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_above_zero(self, "rate_hz", "noise_rms_n", "range_n", "range_nm", "resolution_n")
         check_within(self, latency_s=(0, LONGEST_S))
         good = self._step_n is not None
@@ -108,7 +100,6 @@ class ForceConfig:
         silent_s = self.limits.silent_s
         good = silent_s * self.rate_hz >= 2
         require(good, "limits.silent_s", silent_s, "two periods of rate_hz or more")
-        _ = self.mounting  # refuses a payload under the sample
 
     @property
     def _step_n(self) -> float | None:
@@ -126,11 +117,6 @@ class ForceConfig:
             range_n=self.range_n,
             mount=self.mount,
         )
-
-    @cached_property
-    def mounting(self) -> Mounting:
-        """Where the cell sits and what it carries."""
-        return Mounting(self.mount, self.frame, self.payload)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,8 +243,7 @@ class RtdeWrench:
     """
 
     def __init__(self, config: ForceConfig, arm: NodeArm) -> None:
-        mounting = config.mounting
-        if mounting.frame.vector.any() or mounting.payload is not None:
+        if config.frame.vector.any() or config.payload is not None:
             raise ValueError("frame, payload: expected zeros and none, the controller knows both")
         self._config, self._arm, self._clock = config, arm, arm.clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
@@ -347,4 +332,4 @@ def force_source(
         cell = RtdeWrench(config, arm)
     else:
         raise TypeError(f"no source of force for {type(config).__name__}")
-    return TipForce(cell, config.mounting, arm.recent)
+    return TipForce(cell, config, arm.recent)

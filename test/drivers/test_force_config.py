@@ -46,7 +46,7 @@ def test_the_shipped_robotous_is_refused_for_1_cn_and_serves_newtons():
     ):
         read_force_config(Path("can_rft40.yaml"), force_n=0.01)
     config = read_force_config(Path("can_rft40.yaml"), force_n=2.0)
-    assert config.mounting.payload.mass_kg == 0.05
+    assert config.payload.mass_kg == 0.05
 
 
 def test_a_topic_is_read():
