@@ -67,9 +67,6 @@ class Client:
         self._led = False  # the owner states how far simulated time may go
         self._fed_ns = 0  # when the watchdog was fed, by a velocity too, in simulated time or this machine's
         self._until_ns = 0  # up to when simulated time may go on
-        self._fed = (
-            False  # the newest message was a velocity that the robot took, which feeds its watchdog
-        )
         # number and deceleration of a stop that the robot has not taken yet
         self._owed: tuple[int, float] | None = None
 
@@ -82,7 +79,7 @@ class Client:
                         self._request(json.loads(message))
                     else:
                         self._obey(UrCommand.unpack(message))
-                if self._session is not None and not self._fed:
+                if self._session is not None:
                     self._keep_alive(self._session)
         except OwnerGoneError:
             self._leave()
@@ -99,7 +96,6 @@ class Client:
                 select.select([self._commands, self._clock], [], [])
                 pause_ms = 0
         messages: list[bytes] = []
-        self._fed = False
         ready = self._told.poll(pause_ms)
         while ready:
             try:
@@ -123,15 +119,15 @@ class Client:
         assert session is not None
         if command.kind == STOP:
             # whether the stop succeeds or not, no velocity is sent again
-            session.motion.rest(command.acceleration)
+            session.rest(command.acceleration)
             self._owed = command.number, command.acceleration
             self._pay(session)
         elif command.kind == SPEED:
-            done = self._do(session.motion.speed, command.twist, command.acceleration)
+            done = self._do(session.speed, command.twist, command.acceleration)
             if done:
                 self._owed = None
                 if self._clock is None:
-                    self._fed, self._fed_ns = True, time.monotonic_ns()
+                    self._fed_ns = time.monotonic_ns()
             self._exchange.report(command.number, done)
         if command.until_ns and self._clock is not None:
             # the owner sends this when the time that it sent last is reached
@@ -141,7 +137,7 @@ class Client:
                 self._feed(session)
                 self._fed_ns = self._until_ns
             self._until_ns = command.until_ns
-            self._clock.hold(command.until_ns, Demand(command.demand), session.motion.packets)
+            self._clock.hold(command.until_ns, Demand(command.demand), session.packets)
             self._exchange.hear(command.until_ns)
 
     def _request(self, request: dict) -> None:
@@ -180,7 +176,7 @@ class Client:
         """Let simulated time stand until the owner sends how far it may go."""
         if self._clock is None or self._session is None:
             return
-        self._session.motion.packets = 0
+        self._session.packets = 0
         self._until_ns = self._clock.ask_ns()
         self._clock.hold(self._until_ns, Demand.NONE, 0)
         self._clock.ask_ns()  # answered after the hold was received
@@ -214,22 +210,22 @@ class Client:
             return
         (number, deceleration), seen = self._owed, self._exchange.seen
         if not seen & FAULTY:
-            done = self._do(session.motion.stop, deceleration)
+            done = self._do(session.stop, deceleration)
             self._exchange.report(number, done)
             if done:
                 self._owed = None
             return
         self._exchange.report(number, True)  # nothing runs that could be stopped
-        if seen & REVIVED and self._do(session.motion.stop, deceleration):
+        if seen & REVIVED and self._do(session.stop, deceleration):
             # a program that went on, or began, without us finds the old velocity in its register
             self._owed = None
 
     def _keep_alive(self, session: Session) -> None:
         """Keep the watchdog quiet while nothing moves or the owner lives."""
-        config, motion = session.config, session.motion
-        if self._owed is None and motion.commanded and self._faulty:
+        config = session.config
+        if self._owed is None and session.commanded and self._faulty:
             # what was under way is not to go on, should the program do so
-            motion.rest(config.max_acceleration_m_s2)
+            session.rest(config.max_acceleration_m_s2)
             self._owed = 0, config.max_acceleration_m_s2
         self._pay(session)
         if self._clock is not None:
@@ -239,7 +235,7 @@ class Client:
         now_ns = time.monotonic_ns()
         if now_ns - self._fed_ns <= 1e9 / (3 * config.watchdog_hz):
             return
-        if not motion.commanded or self._exchange.silence_s() <= config.owner_timeout_s:
+        if not session.commanded or self._exchange.silence_s() <= config.owner_timeout_s:
             self._feed(session)
             self._fed_ns = now_ns
 
@@ -247,7 +243,7 @@ class Client:
         """Keep the watchdog quiet, where the program runs that has one."""
         if not self._faulty and session.listening:
             with contextlib.suppress(Exception):
-                session.motion.feed()
+                session.feed()
 
     def _follow_time(self, session: Session) -> None:
         """Let simulated time go on from one feeding to the next."""
@@ -258,7 +254,7 @@ class Client:
             self._feed(session)
             self._fed_ns = now_ns
             self._until_ns = now_ns + round(1e9 / (3 * session.config.watchdog_hz))
-            self._clock.hold(self._until_ns, Demand.NONE, session.motion.packets)
+            self._clock.hold(self._until_ns, Demand.NONE, session.packets)
 
     def _leave(self) -> NoReturn:
         """The owner is gone: stop the arm where that is possible, and end."""
@@ -268,7 +264,7 @@ class Client:
             if self._clock is not None:
                 self._clock.free(Demand.REAL)
             if session is not None and session.listening:
-                session.motion.stop(session.config.max_acceleration_m_s2)
+                session.stop(session.config.max_acceleration_m_s2)
                 session.control.stopScript()
         os._exit(EXIT_ORDERLY)  # the library's destructors wait half a second each
 

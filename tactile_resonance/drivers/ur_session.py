@@ -11,7 +11,6 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import dashboard_client
 import rtde_control
@@ -35,59 +34,14 @@ CLEARING_S = 0.05
 CYCLE_S = 0.002
 
 
-class UrMotion:
-    """Speeds and stops, in the order that the robot's program understands; each says whether it took it.
+class Session:
+    """The library's connection to one robot; nothing is connected before `open`.
 
     A velocity is not acknowledged: it stands in the command register until the robot's program looks, once a
     cycle. The library's ``kickWatchdog`` writes zero into that register, and where both arrive within one cycle
     (the robot's own, or a network that held packets back) the velocity is lost, be it the zero of a stop. So
     once a velocity was sent the watchdog is fed by sending the newest velocity again. A stop is a velocity of
     zero: the library's own ``speedStop`` waits for longer than the watchdog allows.
-
-    Parameters
-    ----------
-    control : rtde_control.RTDEControlInterface
-
-    Attributes
-    ----------
-    packets : int
-        Sent to the robot by these calls.
-    """
-
-    def __init__(self, control: Any) -> None:
-        self._control = control
-        self._twist: tuple[float, ...] = REST
-        self._acceleration_m_s2: float | None = None  # None: no velocity was sent yet
-        self.packets = 0
-
-    @property
-    def commanded(self) -> bool:
-        """Whether the arm moves, or would without end, by a command of ours."""
-        return any(self._twist)
-
-    def speed(self, twist: tuple[float, ...], acceleration: float) -> bool:
-        """Follow a twist until the next call."""
-        self._twist, self._acceleration_m_s2 = twist, acceleration
-        return self.feed()
-
-    def rest(self, deceleration: float) -> None:
-        """Want no velocity any more: from now on the watchdog is fed with zero."""
-        self._twist, self._acceleration_m_s2 = REST, deceleration
-
-    def stop(self, deceleration: float) -> bool:
-        """Brake and stand."""
-        return self.speed(REST, deceleration)
-
-    def feed(self) -> bool:
-        """Keep the robot's watchdog quiet without changing what the arm does."""
-        self.packets += 1
-        if self._acceleration_m_s2 is None:
-            return self._control.kickWatchdog()
-        return self._control.speedL(self._twist, self._acceleration_m_s2, CYCLE_S)
-
-
-class Session:
-    """The library's connection to one robot; nothing is connected before `open`.
 
     Parameters
     ----------
@@ -99,14 +53,17 @@ class Session:
     ----------
     config : UrArmConfig
     control : rtde_control.RTDEControlInterface
-    motion : UrMotion
+    packets : int
+        Velocities, or signs of life, that were sent to the robot.
     """
 
     control: rtde_control.RTDEControlInterface
-    motion: UrMotion
 
     def __init__(self, config: UrArmConfig, clock: SimulatedClock | None) -> None:
         self.config, self._clock = config, clock
+        self._twist: tuple[float, ...] = REST
+        self._acceleration_m_s2: float | None = None  # None: the program has got no velocity yet
+        self.packets = 0
 
     def open(self) -> None:
         """Connect, start the program, prepare it. Raises `ArmError`, see `UrArm.connect`.
@@ -155,6 +112,33 @@ class Session:
         control = self.control
         return control.isConnected() and control.isProgramRunning()
 
+    # velocities: whether the program took them
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the arm moves, or would without end, by a command of ours."""
+        return any(self._twist)
+
+    def speed(self, twist: tuple[float, ...], acceleration: float) -> bool:
+        """Follow a twist until the next call."""
+        self._twist, self._acceleration_m_s2 = twist, acceleration
+        return self.feed()
+
+    def rest(self, deceleration: float) -> None:
+        """Want no velocity any more: from now on the watchdog is fed with zero."""
+        self._twist, self._acceleration_m_s2 = REST, deceleration
+
+    def stop(self, deceleration: float) -> bool:
+        """Brake and stand."""
+        return self.speed(REST, deceleration)
+
+    def feed(self) -> bool:
+        """Keep the robot's watchdog quiet without changing what the arm does."""
+        self.packets += 1
+        if self._acceleration_m_s2 is None:
+            return self.control.kickWatchdog()
+        return self.control.speedL(self._twist, self._acceleration_m_s2, CYCLE_S)
+
     @contextlib.contextmanager
     def _library_hurries(self) -> Iterator[None]:
         """Give the library's thread the priority of this one while answers are awaited and a watchdog counts.
@@ -191,8 +175,8 @@ class Session:
         if not control.setWatchdog(config.watchdog_hz):
             raise ArmError(ArmFault.COMMAND_REFUSED, "setWatchdog was refused")
         self._limit_time()
-        self.motion = UrMotion(control)
-        self.motion.feed()
+        self._twist, self._acceleration_m_s2 = REST, None
+        self.feed()
 
     def _settle(self) -> None:
         """In simulated time: let the library see that the program is ready for the next command."""

@@ -81,7 +81,7 @@ def test_the_bench_is_told_how_many_packets_are_on_their_way():
     """So it waits for a velocity that was sent before the time was let go on."""
     pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
     from tactile_resonance.drivers.ur_client import Client
-    from tactile_resonance.drivers.ur_session import UrMotion
+    from tactile_resonance.drivers.ur_session import Session
 
     held, control = [], SimpleNamespace(speedL=lambda *_: True, kickWatchdog=lambda: True)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -89,7 +89,8 @@ def test_the_bench_is_told_how_many_packets_are_on_their_way():
         page.truncate(SIZE)
         client = Client(theirs, Exchange(page.fileno()))
         client._clock = SimpleNamespace(hold=lambda *said: held.append(said))
-        client._session = SimpleNamespace(motion=UrMotion(control), config=UrArmConfig("127.0.0.1"))
+        client._session = Session(UrArmConfig("127.0.0.1"), None)
+        client._session.control = control
         ends_ns = [CYCLE_NS * n for n in range(1, 4)]
         client._obey(UrCommand(SPEED, 1, ends_ns[0], Demand.FAST, tuple(UP), 0.5))
         client._obey(UrCommand(NOTHING, 0, ends_ns[1], Demand.NONE))

@@ -203,7 +203,7 @@ def test_only_the_program_that_was_guarded_is_ours(states_of_program, fault, rev
 
 
 class Control:
-    """What `Motion` says to ur_rtde."""
+    """What a `Session` says to ur_rtde."""
 
     def __init__(self):
         self.said = []
@@ -219,27 +219,28 @@ class Control:
 
 def test_the_watchdog_is_fed_with_the_newest_velocity_and_never_with_an_older_one():
     pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
-    from tactile_resonance.drivers.ur_session import UrMotion
+    from tactile_resonance.drivers.ur_session import Session
 
     control = Control()
-    motion = UrMotion(control)
+    session = Session(UrArmConfig("127.0.0.1"), None)
+    session.control = control
     twist = (0.0, 0.0, -0.005, 0.0, 0.0, 0.0)
-    assert motion.feed()
-    assert not motion.commanded
-    motion.speed(twist, 0.5)
-    motion.feed()
-    assert motion.commanded
-    motion.rest(1.5)  # nothing is sent, but from now on zero
-    assert not motion.commanded
-    motion.feed()
-    motion.speed(twist, 0.5)
-    motion.stop(2.0)
-    motion.feed()
-    assert not motion.commanded
+    assert session.feed()
+    assert not session.commanded
+    session.speed(twist, 0.5)
+    session.feed()
+    assert session.commanded
+    session.rest(1.5)  # nothing is sent, but from now on zero
+    assert not session.commanded
+    session.feed()
+    session.speed(twist, 0.5)
+    session.stop(2.0)
+    session.feed()
+    assert not session.commanded
     assert control.said == [
         "kick", (twist, 0.5), (twist, 0.5), (REST, 1.5), (twist, 0.5), (REST, 2.0), (REST, 2.0)
     ]  # fmt: skip
-    assert motion.packets == len(control.said)
+    assert session.packets == len(control.said)
 
 
 def test_shipped_configuration_is_that_of_the_simulated_robot():
