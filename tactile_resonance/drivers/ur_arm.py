@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from tactile_resonance.clock import Clock, SimulatedClock, WallClock
+from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.interfaces import (
     ArmError,
     ArmFault,
@@ -84,7 +84,7 @@ class UrArm:
         self.led: LedClock | None = None
         self.heard_s = 0.0
         self.client: ClientProcess | None = None
-        self._asked: SimulatedClock | None = None
+        self._asked: AskedClock | None = None
         self._states: StateReader | None = None
         self._number = 0
         # number, kind and time [s] of commands without an answer yet
@@ -129,10 +129,9 @@ class UrArm:
             return
         self._begin()
         client = ClientProcess(self.config, simulated_time=bool(self.time_server))
-        names = {"time": self.time_server, "time_name": client_name()}
-        self._ask({"name": "connect", "config": self.config.to_dict(), **names}, client)
+        self._ask("connect", self.config, self.time_server, client_name(), of=client)
         if self.led is not None:
-            self._ask({"name": "lead"}, client)
+            self._ask("lead", of=client)
             self.led.dated = False  # time has gone on, and the loop has not received it
         self.client = client  # not before: a loop in another thread would send commands to it
         self._guard()
@@ -211,9 +210,9 @@ class UrArm:
         if clock is not None:
             self.clock = clock.bench
         else:
-            self.clock = AskedClock(self._asked) if self._asked else WallClock()
+            self.clock = self._asked or WallClock()
         if self.client is not None:
-            self._ask({"name": "follow" if clock is None else "lead"})
+            self._ask("follow" if clock is None else "lead")
 
     def catch_up(self, robot_ns: int) -> None:
         """Wait for the state that the bench has sent, of a time of the robot [ns]."""
@@ -251,7 +250,7 @@ class UrArm:
             return True
         self._check_stop()
         self._reader.guard(False)
-        self._ask({"name": "restart"})
+        self._ask("restart")
         self._guard()
         if self.led is not None:
             self.led.dated = False
@@ -261,8 +260,7 @@ class UrArm:
         """Receive the robot's states, and check that nothing forbids motion."""
         try:
             if self.time_server and self._asked is None:
-                self._asked = SimulatedClock(self.time_server, f"{client_name()}: owner")
-                self.clock = AskedClock(self._asked)
+                self.clock = self._asked = AskedClock(self.time_server, f"{client_name()}: owner")
             stream = RtdeStream(self.config.host, self.config.rate_hz)
             trip_s = 0.0 if self.time_server else stream.round_trip_s
             self._states = StateReader(stream, lambda: self.clock.now_ns(), trip_s)
@@ -300,7 +298,7 @@ class UrArm:
 
     def _await_state(self, seconds: float) -> None:
         """Return when something has come from the robot, after a time at the latest."""
-        with contextlib.suppress(ValueError):  # closed meanwhile, which the next look finds
+        with contextlib.suppress(OSError, ValueError):  # closed meanwhile, which the next look finds
             select.select([self._reader.stream], [], [], seconds)
 
     def _check_stop(self) -> None:
@@ -311,17 +309,17 @@ class UrArm:
         if stop is not None:  # not released yet
             raise ArmError(*stop)
 
-    def _ask(self, request: dict, client: ClientProcess | None = None) -> None:
-        client = client or self.client
+    def _ask(self, name: str, *arguments: object, of: ClientProcess | None = None) -> None:
+        client = of or self.client
         assert client is not None
         try:
-            client.ask(request, self.receive)
+            client.ask((name, *arguments), self.receive)
         except ArmError as error:
             client.end()
             runs = self._states is not None and self._states.newest is not None
             runs = runs and self._states.newest.runtime_state == PROGRAM_PLAYING
             self._forget()
-            if request["name"] == "connect" and "not ready" in str(error) and runs:
+            if name == "connect" and "not ready" in str(error) and runs:
                 # the library asks it to end in a register that the program may not read, and waits for ever
                 text = "another program runs there and does not end; stop it at the robot"
                 raise ArmError(

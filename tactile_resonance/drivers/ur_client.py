@@ -12,8 +12,8 @@ command; else from one feeding of the watchdog to the next.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
+import pickle
 import select
 import signal
 import socket
@@ -40,7 +40,6 @@ from tactile_resonance.drivers.ur_exchange import (
     UrCommand,
 )
 from tactile_resonance.drivers.ur_session import Session
-from tactile_resonance.fields import read_dataclass
 
 LONGEST_MESSAGE = 8192
 # No command is given to a robot of which the owner has seen nothing for so long.
@@ -75,8 +74,8 @@ class Client:
         try:
             while True:
                 for message in self._wait():
-                    if message[:1] == b"{":
-                        self._request(json.loads(message))
+                    if message[:1] == pickle.PROTO:
+                        self._request(*pickle.loads(message))
                     else:
                         self._obey(UrCommand.unpack(message))
                 if self._session is not None:
@@ -140,26 +139,24 @@ class Client:
             self._clock.hold(command.until_ns, Demand(command.demand), session.packets)
             self._exchange.hear(command.until_ns)
 
-    def _request(self, request: dict) -> None:
-        """Do what the owner asks for, and answer; simulated time stands afterwards."""
-        answer: dict = {"ok": True}
+    def _request(self, name: str, *arguments: Any) -> None:
+        """Do what the owner asks for, and answer with what was wrong; simulated time stands afterwards."""
+        answer = None
         try:
-            if request["name"] == "connect":
-                self._connect(request)
-            elif request["name"] == "restart":
+            if name == "connect":
+                self._connect(*arguments)
+            elif name == "restart":
                 self._restart()
             else:
-                self._led = request["name"] == "lead"
+                self._led = name == "lead"
         except ArmError as error:
-            text = str(error)[len("arm: ") :]
-            answer = {"ok": False, "fault": error.fault.value, "message": text}
+            answer = error.fault, str(error)[len("arm: ") :]
         self._stand()
-        self._commands.send(json.dumps(answer).encode())
+        self._commands.send(pickle.dumps(answer))
 
-    def _connect(self, request: dict) -> None:
-        config = read_dataclass(UrArmConfig, request["config"], "")
-        if request["time"]:
-            self._clock = SimulatedClock(request["time"], request["time_name"])
+    def _connect(self, config: UrArmConfig, time_server: str, time_name: str) -> None:
+        if time_server:
+            self._clock = SimulatedClock(time_server, time_name)
             self._clock.free(Demand.REAL)
         self._opened = session = Session(config, self._clock)
         session.open()

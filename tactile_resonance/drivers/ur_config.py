@@ -6,7 +6,7 @@ from __future__ import annotations
 import ipaddress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from tactile_resonance.contact.interfaces import CommandLimits
 from tactile_resonance.contact.samples import Pose, PoseOfSix
@@ -86,10 +86,6 @@ class UrArmConfig(CommandLimits):
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:  # a name may be anybody's
             return False
-
-    def to_dict(self) -> dict[str, Any]:
-        """Fields as plain values, which `read_dataclass` takes back."""
-        return vars(self) | {"tip_in_flange": self.tip_in_flange.vector.tolist()}
 
 
 def read_ur_config(path: Path) -> UrArmConfig:

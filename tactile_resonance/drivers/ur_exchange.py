@@ -8,9 +8,9 @@ own; neither side waits for the other.
 from __future__ import annotations
 
 import contextlib
-import json
 import mmap
 import os
+import pickle
 import select
 import socket
 import struct
@@ -224,14 +224,14 @@ class ClientProcess:
         except OSError as error:
             raise self._death() from error
 
-    def ask(self, request: dict, meanwhile: Callable[[], None]) -> None:
-        """Send a request and wait for its answer; `meanwhile` is called again and again.
+    def ask(self, request: tuple, meanwhile: Callable[[], None]) -> None:
+        """Send a request, its name first, and wait for its answer; `meanwhile` is called again and again.
 
         Raises ArmError where it fails: the client is ended then.
         """
         deadline = time.monotonic() + self._connect_timeout_s
         try:
-            self._commands.send(json.dumps(request).encode())
+            self._commands.send(pickle.dumps(request))
             while not select.select([self._commands], [], [], 0.02)[0]:
                 meanwhile()
                 if time.monotonic() > deadline:
@@ -245,10 +245,10 @@ class ClientProcess:
             death = self._death()
             self._kill()
             raise death
-        answer = json.loads(data)
-        if not answer["ok"]:
+        fault = pickle.loads(data)
+        if fault is not None:
             self.end()
-            raise ArmError(ArmFault(answer["fault"]), answer["message"])
+            raise ArmError(*fault)
 
     def last_error(self) -> str:
         """The last line that the client wrote."""
