@@ -191,7 +191,7 @@ def run_controller(
         force_rate_n_per_s=1.2 * max(setup.noise_n, 1e-3) / 1e-3,
     )
     controller = ContactController(parameters, limits)
-    loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
+    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
     loop.start(ContactGoal(rig.touch, Aim(FORCE_N)))
     loop.run_while(lambda: controller.result is None)
     ready = len(rig.force_n) if controller.state is State.HOLD else None
@@ -214,7 +214,7 @@ def stiff_peaks(count: int) -> np.ndarray:
         rig = Rig(Case(2.5e-3, 400e3, 1.0, 1e-3 + 2e-6 * seed, 0.0, seed), Setup("stiff"))
         bench = rig.bench
         controller = ContactController(ContactParameters(**KNOWN), Limits())
-        loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
+        loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
         loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))
         loop.run_while(lambda: True, 0.3)
         peaks.append(max(rig.force_n))
@@ -227,7 +227,7 @@ def contact_series(count: int) -> np.ndarray:
     bench = rig.bench
     parameters = ContactParameters(tare_s=0.2, **KNOWN)
     controller = ContactController(parameters, Limits())
-    loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
+    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
     means = []
     for _ in range(count):
         if not loop.make(ContactGoal(rig.touch, Aim(FORCE_N))).reached:

@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from benchmarks.contact_case import FORCE_N, Case, Outcome, Rig, Setup
+from tactile_resonance.contact.vectors import vector
 
 TOUCH_N = 3e-3
 LONGEST_S = 25.0
@@ -160,7 +161,9 @@ def steps_of(rig: Rig, law: Law, force_n: float = FORCE_N) -> Iterator[bool]:
     within, stopped = 0, False
     for n in range(round(LONGEST_S / dt)):
         bench.clock.wait_until((n + 1) * period_ns)
-        samples = [float(sample.force_n[2]) for sample in bench.force.read()]
+        tip = bench.arm.state().tip
+        felt = bench.cell.mounting.to_tip(bench.cell.read(), vector(tip.position_m), tip.turn)
+        samples = [float(sample.force_n[2]) for sample in felt]
         if n * dt < 0.4:
             bias += samples
             continue

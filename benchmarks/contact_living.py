@@ -274,7 +274,7 @@ def _ours(row: Row, rig: Rig) -> Held:
     )
     limits = replace(Limits(depth_m=4.5e-3, approach_s=30.0), **row.limits)
     controller = ContactController(parameters, limits)
-    loop = ContactLoop(bench.arm, bench.force, bench.clock, controller)
+    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
     loop.start(ContactGoal(rig.touch, Aim(row.force_n)))
     loop.run_while(lambda: controller.result is None)
     at, ready = len(rig.force_n), controller.state is State.HOLD

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two devices that contact control needs: an arm and a force source.
+"""The two devices that contact control needs: an arm and a force sensor.
 
 `drivers/` keeps these contracts on real protocols and in real time, `simulation/` in lockstep virtual
 time. The times of their samples are of the monotonic clock, or of the simulation's. What an arm's
@@ -12,12 +12,15 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol
 
 from tactile_resonance.clock import Clock
-from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
+from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import Six, six
 from tactile_resonance.fields import check_within
+
+if TYPE_CHECKING:  # it needs the kinds of mounts
+    from tactile_resonance.contact.payload import Mounting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,22 +158,24 @@ class ForceInfo:
     clock_uncertainty_s: float = 0.0
 
 
-Sample = TypeVar("Sample")
-
-
-class Source(Protocol[Sample]):
-    """A stream of wrenches."""
+class Cell(Protocol):
+    """A force sensor: a stream of wrenches in its own frame."""
 
     @property
     def info(self) -> ForceInfo:
         """What it can do."""
         ...
 
+    @property
+    def mounting(self) -> Mounting:
+        """Where it sits and what it carries: of these follow the wrenches at the tip."""
+        ...
+
     def start(self) -> None:
         """Connect and stream, also after a fault has ended. Raises `ForceError`."""
         ...
 
-    def read(self) -> list[Sample]:
+    def read(self) -> list[CellSample]:
         """Wrenches since the last call, oldest first, without waiting.
 
         Empty where none came; raises `ForceError` where the source is found faulty. After the fault
@@ -181,13 +186,6 @@ class Source(Protocol[Sample]):
     def close(self) -> None:
         """Disconnect; never raises."""
         ...
-
-
-Cell = Source[CellSample]
-"""A force sensor alone: wrenches in its own frame."""
-
-ForceSource = Source[WrenchSample]
-"""Wrenches at the tip."""
 
 
 class Arm(Protocol):

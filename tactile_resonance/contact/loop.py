@@ -16,11 +16,11 @@ from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.free_motion import STILL_M_S
 from tactile_resonance.contact.geometry import TipPath
 from tactile_resonance.contact.goal import TOUCHING, Command, ContactGoal, State
-from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, ForceError, ForceSource
+from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, Cell, ForceError
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.contact.vectors import Vector, turn_from_vector
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 
 STOP_AGAIN_NS = 50_000_000
@@ -46,7 +46,7 @@ class Cycle(NamedTuple):
 
 
 class ContactLoop:
-    """Runs a controller on an arm, a force source and a clock; one thread.
+    """Runs a controller on an arm, a force sensor and a clock; one thread.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class ContactLoop:
     def __init__(
         self,
         arm: Arm,
-        force: ForceSource,
+        force: Cell,
         clock: Clock,
         controller: ContactController,
         listener: Callable[[Cycle], None] | None = None,
@@ -147,9 +147,13 @@ class ContactLoop:
         except ArmError as error:
             fault = fault or error
         try:
-            wrenches = self._force.read()
-        except (ArmError, ForceError) as error:  # the force at the tip needs the arm's pose
+            felt = self._force.read()
+        except ForceError as error:
             fault = fault or error
+        else:
+            if felt and arm is not None:
+                turn = turn_from_vector(arm.rotation_rad)
+                wrenches = self._force.mounting.to_tip(felt, arm.position_m, turn)
         self._seen, self.fault = arm, fault
         # the arm keeps a velocity, so a stop is sent until it has worked, whatever state that ends in
         command = self.controller.step(now, arm, wrenches, fault) or self._owed

@@ -8,15 +8,15 @@ taken off where a contact is controlled (`observer.Observer`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.interfaces import Cell, ForceInfo, Mount
-from tactile_resonance.contact.samples import ArmSample, CellSample, Pose, WrenchSample
+from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.samples import CellSample, Pose, WrenchSample
 from tactile_resonance.contact.vectors import (
     NO_TURN,
     Six,
@@ -28,7 +28,6 @@ from tactile_resonance.contact.vectors import (
     rotated_back,
     scaled,
     transposed,
-    turn_from_vector,
     turn_product,
     vector,
 )
@@ -258,43 +257,3 @@ class Mounting:
             )
             felt.append(WrenchSample(time_ns, (x, y, z), torque, overload))
         return felt
-
-
-class TipForce:
-    """Wrenches at the tip (a `ForceSource`).
-
-    Parameters
-    ----------
-    cell : Cell
-    mounting : Mounting
-    arm_state : callable
-        Newest state of the arm, without waiting; what it raises is passed on.
-
-    Attributes
-    ----------
-    cell : Cell
-    """
-
-    def __init__(self, cell: Cell, mounting: Mounting, arm_state: Callable[[], ArmSample]) -> None:
-        self.cell, self._mounting, self._arm_state = cell, mounting, arm_state
-
-    @property
-    def info(self) -> ForceInfo:
-        """What the cell can do."""
-        return self.cell.info
-
-    def start(self) -> None:
-        """Start the cell. Raises `ForceError`."""
-        self.cell.start()
-
-    def read(self) -> list[WrenchSample]:
-        """Wrenches since the last call, oldest first, with the newest pose. Raises `ForceError`."""
-        samples = self.cell.read()
-        state = self._arm_state()
-        if not samples:
-            return []
-        return self._mounting.to_tip(samples, state.position_m, turn_from_vector(state.rotation_rad))
-
-    def close(self) -> None:
-        """Close the cell."""
-        self.cell.close()

@@ -15,6 +15,7 @@ from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.clocks import STEP_S, ClockTracker
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
+from tactile_resonance.contact.payload import Mounting
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.can_bus import (
     ERROR,
@@ -50,11 +51,13 @@ class CanWrench:
 
     Attributes
     ----------
+    mounting : Mounting
     received : int
         Wrenches since `start`.
     """
 
     def __init__(self, config: CanForce, clock: Clock | None = None) -> None:
+        self.mounting: Mounting = config
         self._config = config
         self.clock: Clock = WallClock() if clock is None else clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)

@@ -25,7 +25,7 @@ from tactile_resonance.contact.interfaces import (
     ForceInfo,
     NodeArm,
 )
-from tactile_resonance.contact.payload import Mounting, TipForce
+from tactile_resonance.contact.payload import Mounting
 from tactile_resonance.contact.samples import ArmSample, CellSample
 from tactile_resonance.contact.vectors import Six, rotated_back, turn_from_vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
@@ -245,6 +245,7 @@ class RtdeWrench:
     def __init__(self, config: ForceConfig, arm: NodeArm) -> None:
         if config.frame.vector.any() or config.payload is not None:
             raise ValueError("frame, payload: expected zeros and none, the controller knows both")
+        self.mounting: Mounting = config
         self._config, self._arm, self._clock = config, arm, arm.clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._robot_time_s = -math.inf
@@ -301,7 +302,7 @@ class RtdeWrench:
 
 def force_source(
     config: ForceConfig, arm: NodeArm, topic: Callable[[TopicForce], Cell] | None = None
-) -> TipForce:
+) -> Cell:
     """Make the source; nothing is opened before its `start`.
 
     Parameters
@@ -317,19 +318,16 @@ def force_source(
     ValueError
         If python-can is not installed, or a topic is asked for outside of a node.
     """
-    cell: Cell
     if isinstance(config, CanForce):
         try:
             from tactile_resonance.drivers.can_wrench import CanWrench
         except ImportError as error:
             raise ValueError("kind: can needs python-can: pip install python-can") from error
-        cell = CanWrench(config, arm.clock)
-    elif isinstance(config, TopicForce):
+        return CanWrench(config, arm.clock)
+    if isinstance(config, TopicForce):
         if topic is None:
             raise ValueError("kind: topic is for nodes only")
-        cell = topic(config)
-    elif type(config) is ForceConfig:
-        cell = RtdeWrench(config, arm)
-    else:
-        raise TypeError(f"no source of force for {type(config).__name__}")
-    return TipForce(cell, config, arm.recent)
+        return topic(config)
+    if type(config) is ForceConfig:
+        return RtdeWrench(config, arm)
+    raise TypeError(f"no source of force for {type(config).__name__}")

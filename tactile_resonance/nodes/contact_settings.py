@@ -13,7 +13,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 
 from tactile_resonance.contact.geometry import TipGeometry
-from tactile_resonance.contact.interfaces import CommandLimits, NodeArm
+from tactile_resonance.contact.interfaces import Cell, CommandLimits, NodeArm
 from tactile_resonance.contact.parameters import (
     STRICTER_ABOVE,
     STRICTER_BELOW,
@@ -23,7 +23,6 @@ from tactile_resonance.contact.parameters import (
     ranges_of,
     read_contact,
 )
-from tactile_resonance.contact.payload import TipForce
 from tactile_resonance.drivers.force_config import CanForce, force_source, read_force_config
 from tactile_resonance.drivers.twist import TwistConfig
 from tactile_resonance.drivers.ur_arm import UrArm
@@ -191,7 +190,7 @@ def require_arm_allows(
         require(value >= least, "period_s", value, f"1/rate_hz = {least:g} of robot_config or more")
 
 
-def make_force_source(node: ManagedNode, arm: NodeArm) -> TipForce:
+def make_force_source(node: ManagedNode, arm: NodeArm) -> Cell:
     """The force source that the parameters name, not started yet; ValueError where they are wrong."""
     name, host, stalls_s = values(node, "force_config", "force_host", "simulated_stalls_s")
     config = read_force_config(Path(name).expanduser())

@@ -11,11 +11,10 @@ from collections.abc import Callable
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.interfaces import ForceError, Mount, NodeArm
+from tactile_resonance.contact.interfaces import Cell, ForceError, Mount, NodeArm
 from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import IDLE_PERIODS, ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.payload import TipForce
 
 # A tip that cannot be drawn back in this time is left where the envelope stopped it.
 RETRACT_WITHIN_S = 12.0
@@ -41,7 +40,7 @@ class ContactThread:
 
     Parameters
     ----------
-    arm, force : NodeArm, TipForce
+    arm, force : NodeArm, Cell
         Connected and started.
     parameters, limits : ContactParameters, Limits
     tip : TipGeometry
@@ -65,7 +64,7 @@ class ContactThread:
     def __init__(
         self,
         arm: NodeArm,
-        force: TipForce,
+        force: Cell,
         parameters: ContactParameters,
         limits: Limits,
         tip: TipGeometry,
@@ -83,7 +82,7 @@ class ContactThread:
         self._time_passed = False  # simulated time has gone on while the loop waited for the lock
         self._source_tried_ns: int | None = None
         self._alive_s = time.monotonic()
-        self._led = arm.led_clock(force.cell, self._stay)
+        self._led = arm.led_clock(force, self._stay)
         self.clock: Clock = self._led or arm.clock
         idle_periods = min(MOST_IDLE_PERIODS, int(told_s / parameters.period_s))
         self.controller = ContactController(

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
+from tactile_resonance.contact.payload import Mounting
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.force_config import TopicForce
 from tactile_resonance.nodes.running import SERIES
@@ -58,6 +59,7 @@ class TopicWrench:
     """
 
     def __init__(self, node: Node, config: TopicForce, clock: Clock | None = None) -> None:
+        self.mounting: Mounting = config
         self._node, self._config = node, config
         self._clock: Clock = WallClock() if clock is None else clock
         self.arrivals = Arrivals()

@@ -82,7 +82,7 @@ def contact(
     )
     limits = Limits() if limits is None else limits
     controller = ContactController(parameters, limits, under_sample=under_sample)
-    loop = ContactLoop(rig.arm, rig.force, rig.clock, controller)
+    loop = ContactLoop(rig.arm, rig.cell, rig.clock, controller)
     goal = ContactGoal(touch, Aim(FORCE_N) if aim is None else aim)
     return Contact(rig, controller, loop, goal)
 

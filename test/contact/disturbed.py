@@ -47,8 +47,14 @@ class LyingArm(Lying):
 
 
 class LyingForce(Lying):
-    def read(self):
-        return [self._seen(sample) for sample in self._device.read()]
+    """Its wrenches at the tip are changed: it is its own mounting."""
+
+    @property
+    def mounting(self):
+        return self
+
+    def to_tip(self, samples, tip_m, tip_turn):
+        return [self._seen(s) for s in self._device.mounting.to_tip(samples, tip_m, tip_turn)]
 
 
 @dataclass
@@ -69,7 +75,7 @@ class Disturbed:
 def disturbed(tissue, **options):
     made = contact(tissue, **options)
     bench = made.bench
-    arm, force = LyingArm(bench.arm), LyingForce(bench.force)
+    arm, force = LyingArm(bench.arm), LyingForce(bench.cell)
     made.loop = ContactLoop(arm, force, bench.clock, made.controller)
     rig = Disturbed(made, arm, force, [], [], [])
     touch = made.goal.touch

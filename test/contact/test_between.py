@@ -216,7 +216,7 @@ def test_fault_of_the_cell_on_a_way_without_a_rest_is_named_and_presses_no_harde
         setattr(rig.bench.cell.faults, name, type(FAULTS[name])(0))
     rig.loop.retract()
     rig.run(1.0)
-    rig.bench.force.start()
+    rig.bench.cell.start()
     order, result, _ = states(rig, goal(rig, 0.0))
     assert State.TARE in order
     assert result.reached

@@ -149,7 +149,7 @@ def test_fault_of_the_arm_stops_the_tip_where_it_is(name, state):
     # after the repair the tip moves only when it is told to
     made.bench.arm.repair()
     made.bench.arm.connect()
-    made.bench.force.start()
+    made.bench.cell.start()
     place = made.bench.clock.motion.reported.position_m
     made.run(0.1)
     np.testing.assert_allclose(made.bench.clock.motion.reported.position_m, place, atol=1e-6)

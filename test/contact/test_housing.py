@@ -29,7 +29,7 @@ def with_tip(tip, limits=None, **options):
     limits = Limits() if limits is None else limits
     made.controller = ContactController(QUICK, limits, tip)
     bench = made.bench
-    made.loop = ContactLoop(bench.arm, bench.force, bench.clock, made.controller)
+    made.loop = ContactLoop(bench.arm, bench.cell, bench.clock, made.controller)
     return made
 
 

@@ -188,7 +188,7 @@ def test_a_fifth_of_the_usual_force_is_held_and_its_loss_is_told(seed):
     cell = replace(cell, force_bias_n=(0.0, 0.0, 0.5))  # most of the dish: within its counts
     parameters = replace(QUICK, cell_noise_n=2e-4)
     made = contact(parameters=parameters, cell_parameters=cell, aim=Aim(2e-3), seed=seed)
-    require_fit(made.bench.force.info, 2e-3)
+    require_fit(made.bench.cell.info, 2e-3)
     result = made.loop.make(made.goal)
     assert result.reached, result.message
     begun = len(made.force_n)
@@ -344,7 +344,7 @@ def test_tip_left_pressing_beside_the_goal_is_lifted_before_it_goes_along():
     touch = made.goal.touch
     beside = ContactGoal(Pose(touch.position_m + [3e-3, 0, 0], touch.rotation_rad), made.goal.aim)
     controller = ContactController(QUICK, Limits())
-    loop = ContactLoop(made.bench.arm, made.bench.force, made.bench.clock, controller)
+    loop = ContactLoop(made.bench.arm, made.bench.cell, made.bench.clock, controller)
     way, since = [], len(made.force_n)
     made.bench.clock.on_step.append(lambda: way.append(made.bench.plant.tip_m[0]))
     assert loop.make(beside).reached
@@ -360,7 +360,7 @@ def test_force_that_leaves_a_tip_left_pressing_is_no_touch():
     assert made.loop.make(made.goal).reached
     # a new controller knows nothing of that, and is to touch at the same place
     controller = ContactController(QUICK, Limits())
-    loop = ContactLoop(made.bench.arm, made.bench.force, made.bench.clock, controller)
+    loop = ContactLoop(made.bench.arm, made.bench.cell, made.bench.clock, controller)
     result = loop.make(made.goal)
     assert result.reached, result.message
 

@@ -222,7 +222,7 @@ def storm(rng, names):
     for end in ends:
         end()
     repaired(rig)
-    rig.bench.force.start()
+    rig.bench.cell.start()
     rig.run(0.02)
     rig.controller.retract()
     rig.run_until(State.IDLE, 12.0)

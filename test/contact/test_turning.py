@@ -118,7 +118,7 @@ class Travel:
         self.bench = ContactBench(SOFT, surface, start, tip=Tip(RADIUS_M))
         self.controller = ContactController(QUICK, limits, tip)
         rig = self.bench
-        self.loop = ContactLoop(rig.arm, rig.force, rig.clock, self.controller)
+        self.loop = ContactLoop(rig.arm, rig.cell, rig.clock, self.controller)
         self.poses, self.twists, self.force_n = [], [], []
         rig.clock.on_step.append(self.record)
 

@@ -124,16 +124,15 @@ def test_the_tip_feels_what_presses_on_the_cell_under_the_sample():
     normal = state.tip.rotation.apply([0, 0, 1])
     quiet = CellParameters("quiet", 5000.0, 1e5, 1e-3, 5e-5, 5.0, 0.3)
     bench = CellBench(quiet, (*(-0.01 * normal), 0.0, 0.0, 0.0))
-    source = force_source(
-        bench.config(), SimpleNamespace(recent=lambda: state, clock=bench.clock)
-    )
+    source = force_source(bench.config(), SimpleNamespace(clock=bench.clock))
     try:
         source.start()
         samples = bench.go(source, 1000)
     finally:
         source.close()
         bench.close()
-    force = np.array([sample.force_n for sample in samples])
+    felt = source.mounting.to_tip(samples, state.position_m, state.tip.turn)
+    force = np.array([sample.force_n for sample in felt])
     assert force.shape == (1000, 3)
     np.testing.assert_allclose(force.mean(axis=0), [0, 0, 0.01], atol=5 * 1e-3 / np.sqrt(1000))
 

@@ -51,7 +51,7 @@ def test_a_simulated_robot_that_stalls_is_waited_for_longer():
     arm = contact_settings.make_arm(node, 0)
     assert arm.config.max_state_age_s == pytest.approx(HARDWARE.max_state_age_s + 0.05)
     assert 1 / arm.config.watchdog_hz == pytest.approx(1 / HARDWARE.watchdog_hz + 0.05)
-    cell = contact_settings.make_force_source(node, arm).cell
+    cell = contact_settings.make_force_source(node, arm)
     assert cell._config.limits.silent_s == pytest.approx(0.01 + 0.05)
 
 
@@ -102,7 +102,7 @@ def test_the_force_sensor_of_a_universal_robot_is_refused_with_a_twist_controlle
     with pytest.raises(ValueError, match=r"rtde_ur.yaml' is of kind rtde, accepted .* can, topic"):
         contact_settings.make_force_source(node, twist_arm)
     topic = contact_settings.make_force_source(Node(force_config="topic.yaml"), twist_arm)
-    assert isinstance(topic.cell, TopicWrench)
+    assert isinstance(topic, TopicWrench)
 
 
 def test_a_loop_faster_than_the_poses_and_speeds_beyond_the_arm_are_refused(twist_arm):

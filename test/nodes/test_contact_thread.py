@@ -52,7 +52,7 @@ class Rig:
         self.connect_now.set()
         self.states_while_connecting = 0
         self.thread = ContactThread(
-            self, self.bench.force, QUICK, Limits(), None, self._listen, self.failed.set, told_s
+            self, self.bench.cell, QUICK, Limits(), None, self._listen, self.failed.set, told_s
         )
 
     def begin(self):

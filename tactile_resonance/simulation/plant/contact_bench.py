@@ -23,7 +23,7 @@ from tactile_resonance.contact.interfaces import (
     ForceInfo,
     Mount,
 )
-from tactile_resonance.contact.payload import Mounting, Payload, TipForce
+from tactile_resonance.contact.payload import Mounting, Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import six, vector
 from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
@@ -260,11 +260,10 @@ class VirtualArm:
 class VirtualCell(Transducer):
     """A `Cell` on the bench: one wrench per period of the robot.
 
-    With `TipForce` around it, it is a `ForceSource`.
-
     Parameters
     ----------
     bench : VirtualBench
+    mounting : Mounting
     parameters : CellParameters, optional
         By default those of ``config/load_cells/fine.yaml``.
     seed : int
@@ -280,13 +279,14 @@ class VirtualCell(Transducer):
     def __init__(
         self,
         bench: VirtualBench,
+        mounting: Mounting,
         parameters: CellParameters | None = None,
         seed: int = 0,
     ) -> None:
         p = CellParameters.from_yaml() if parameters is None else parameters
         super().__init__(p, seed)
         self.error: ForceFault | None = None
-        self._bench = bench
+        self._bench, self.mounting = bench, mounting
         self._scale = np.repeat([1 / p.force_divisor, 1 / p.torque_divisor], 3)
         self._waiting: list[CellSample] = []
         self._count = 0
@@ -302,7 +302,7 @@ class VirtualCell(Transducer):
             noise_rms_n=p.force_noise_rms_n,
             resolution_n=1 / p.force_divisor,
             range_n=p.force_range_n,
-            mount=self._bench.plant.mounting.mount,
+            mount=self.mounting.mount,
         )
 
     def start(self) -> None:
@@ -370,8 +370,6 @@ class ContactBench:
     clock : VirtualBench
     arm : VirtualArm
     cell : VirtualCell
-    force : TipForce
-        The cell as a force source at the tip.
     """
 
     def __init__(
@@ -402,8 +400,8 @@ class ContactBench:
         motion = TipMotion(tracking or TrackingParameters(), start, period_s=period_s, seed=seed)
         self.clock = VirtualBench(self.plant, motion)
         self.arm = VirtualArm(self.clock)
-        self.cell = VirtualCell(self.clock, cell_parameters, seed=seed)
         payload = Payload(tool_kg, vector(centre)) if on_tool else None
-        self.force = TipForce(self.cell, Mounting(mount, Pose.at_origin(), payload), self.arm.state)
+        seat = Mounting(mount, Pose.at_origin(), payload)
+        self.cell = VirtualCell(self.clock, seat, cell_parameters, seed=seed)
         self.arm.connect()
-        self.force.start()
+        self.cell.start()

@@ -89,9 +89,9 @@ def indent_tissue(
     hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
     goal = ContactGoal(touch, Aim(force_n, hold), hold_s=hold_s, unload_speed_m_s=unload_speed_m_s)
     ball = BallTip(radius_m, poisson_ratio, stiffness)
-    recorder = IndentationRecorder(goal, protocol, ball, bench.force.info.name, simulated=True)
+    recorder = IndentationRecorder(goal, protocol, ball, bench.cell.info.name, simulated=True)
     controller = ContactController(parameters, limits, under_sample=True)
-    loop = ContactLoop(bench.arm, bench.force, bench.clock, controller, recorder.take)
+    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller, recorder.take)
     loop.start(goal)
     ended = (State.IDLE, State.FAULT)
     loop.run_while(lambda: controller.state not in ended, hold_s + LONGER_S)
