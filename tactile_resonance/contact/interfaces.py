@@ -144,7 +144,6 @@ class ForceInfo:
     rate_hz : float
     noise_rms_n, resolution_n, range_n : float
         Noise of one sample, smallest step, largest force [N].
-    mount : Mount
     clock_uncertainty_s : float
         Standard deviation of `WrenchSample.time_ns` against this machine's clock [s].
     """
@@ -154,7 +153,6 @@ class ForceInfo:
     noise_rms_n: float
     resolution_n: float
     range_n: float
-    mount: Mount
     clock_uncertainty_s: float = 0.0
 
 

@@ -115,7 +115,6 @@ class ForceConfig(Mounting):
             noise_rms_n=self.noise_rms_n,
             resolution_n=self._step_n,
             range_n=self.range_n,
-            mount=self.mount,
         )
 
 

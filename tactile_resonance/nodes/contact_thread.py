@@ -87,7 +87,7 @@ class ContactThread:
         idle_periods = min(MOST_IDLE_PERIODS, int(told_s / parameters.period_s))
         self.controller = ContactController(
             *(parameters, limits, tip),
-            under_sample=force.info.mount is Mount.TABLE,
+            under_sample=force.mounting.mount is Mount.TABLE,
             # simulated time ends where a block does, and a block waits for the force at its end
             calm_periods=1 if self.clock.simulated else CALM_PERIODS,
             # simulated time needs no haste, and there the arm's watchdog is fed once a period

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 def test_the_simulated_cell_serves_1_cn():
     config = read_force_config(Path("can_simulated.yaml"), force_n=0.01)
     assert config.info.resolution_n == pytest.approx(2e-4)
-    assert config.info.mount is Mount.TABLE
+    assert config.mount is Mount.TABLE
     assert config.bus["tcp_tune"] is True
     np.testing.assert_allclose(np.diag(config.scale), [2e-4] * 3 + [1e-5] * 3)
 

@@ -302,7 +302,6 @@ class VirtualCell(Transducer):
             noise_rms_n=p.force_noise_rms_n,
             resolution_n=1 / p.force_divisor,
             range_n=p.force_range_n,
-            mount=self.mounting.mount,
         )
 
     def start(self) -> None:
