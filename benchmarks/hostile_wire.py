@@ -31,7 +31,7 @@ from tactile_resonance.simulation.ur5e.controller import UrController
 from tactile_resonance.simulation.ur5e.reactor import Service
 
 GREETINGS = {b"V": b"\1", b"S": b"\1"}
-TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,UINT32,UINT32,INT32,INT32"
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,UINT32,UINT32,INT32"
 PROGRAM = b"def a():\n  textmsg(1)\nend\n"
 
 
@@ -120,7 +120,7 @@ def _read_robot(host: str, _: int) -> None:
 
 def _state() -> bytes:
     """A data package of the recipe that the driver asks for: all of it zero."""
-    payload = bytes(1 + 8 * 19 + 4 * 4)
+    payload = bytes(1 + 8 * 19 + 4 * 3)
     return struct.pack(">Hc", 3 + len(payload), b"U") + payload
 
 

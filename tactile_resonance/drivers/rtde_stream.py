@@ -32,7 +32,6 @@ _VARIABLES = (
     ("safety_status_bits", "UINT32", "I"),
     ("runtime_state", "UINT32", "I"),
     ("robot_mode", "INT32", "i"),
-    ("safety_mode", "INT32", "i"),
 )
 _STATE = struct.Struct(">HcB" + "".join(code for _, _, code in _VARIABLES))
 _HEAD = struct.Struct(">HB")
@@ -50,7 +49,7 @@ class RobotState(NamedTuple):
     pose, speed, force : tuples of 6 floats
         Of the tool centre point in the base [m, rad], [m/s, rad/s], [N, N m]; the force is measured by the
         robot's own sensor.
-    safety_bits, runtime_state, robot_mode, safety_mode : int
+    safety_bits, runtime_state, robot_mode : int
         As RTDE names them.
     """
 
@@ -61,7 +60,6 @@ class RobotState(NamedTuple):
     safety_bits: int
     runtime_state: int
     robot_mode: int
-    safety_mode: int
 
 
 # what `RobotState` itself calls, at half of the time

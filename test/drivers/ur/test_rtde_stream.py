@@ -21,9 +21,9 @@ HOST = f"127.{1 + os.getpid() % 250}.{1 + os.getpid() // 250 % 250}.231"
 VERSION = b"\x00\x05V\x00\x02"
 NAMES = (
     b"timestamp,actual_TCP_pose,actual_TCP_speed,actual_TCP_force,safety_status_bits,runtime_state,"
-    b"robot_mode,safety_mode"
+    b"robot_mode"
 )
-TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,UINT32,UINT32,INT32,INT32"
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,UINT32,UINT32,INT32"
 
 
 def packet(kind, payload=b""):
@@ -59,7 +59,7 @@ def connected(serve):
 def state(number):
     """A state of which every figure tells where it belongs."""
     vectors = 1e-3 * (number + np.arange(18.0)).reshape(3, 6)
-    return RobotState(0.002 * number, *map(tuple, vectors.tolist()), 1 << 11 | 1, 2, -1, 7)
+    return RobotState(0.002 * number, *map(tuple, vectors.tolist()), 1 << 11 | 1, 2, -1)
 
 
 def data(it):
@@ -67,8 +67,7 @@ def data(it):
     payload = b"\x01" + struct.pack(">d", it.robot_time_s)
     for vector in (it.pose, it.speed, it.force):
         payload += struct.pack(">6d", *vector)
-    payload += struct.pack(">II", it.safety_bits, it.runtime_state)
-    return packet(b"U", payload + struct.pack(">ii", it.robot_mode, it.safety_mode))
+    return packet(b"U", payload + struct.pack(">IIi", it.safety_bits, it.runtime_state, it.robot_mode))
 
 
 def read(stream, count):

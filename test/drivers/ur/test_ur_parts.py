@@ -85,7 +85,7 @@ def test_sign_of_life_ages_until_the_next(exchanges):
 
 def state(time_s, runtime=2, safety=1, mode=7, z_m=0.3):
     return RobotState(
-        time_s, (0.1, 0.2, z_m, 0.0, 0.0, 0.0), (0.01,) * 6, (-1.0,) * 6, safety, runtime, mode, 1
+        time_s, (0.1, 0.2, z_m, 0.0, 0.0, 0.0), (0.01,) * 6, (-1.0,) * 6, safety, runtime, mode
     )
 
 
