@@ -265,26 +265,23 @@ class ForceRecord:
             oldest_ns = self._forces[0][0] if full else -math.inf
             heard, placed = (_cut(rows, t0_ns, t1_ns) for rows in (self._forces, self._poses))
         (times, rows), (pose_times, poses) = _columns(heard, 1), _columns(placed, 6)
-        spans = _Spans(times, rows, t0_ns, t1_ns, self._force_gap_ns)
-        places = _Spans(pose_times, poses[:, :3], t0_ns, t1_ns, POSE_GAP_NS)
+        coverage, mean, batches_n = _averages(times, rows, t0_ns, t1_ns, self._force_gap_ns)
+        known, place_m, _ = _averages(pose_times, poses[:, :3], t0_ns, t1_ns, POSE_GAP_NS)
         position_m = rotation_rad = (math.nan, math.nan, math.nan)
-        if places.coverage >= LEAST_COVERAGE:
-            position_m = vector(places.mean())
+        if known >= LEAST_COVERAGE:
+            position_m = vector(place_m)
             rotation_rad = vector(poses[np.abs(pose_times - (t0_ns + t1_ns) // 2).argmin(), 3:])
-        reason = self._missing(t0_ns, t1_ns, now_ns, oldest_ns, spans.coverage)
+        reason = self._missing(t0_ns, t1_ns, now_ns, oldest_ns, coverage)
         if reason:
             nan = math.nan
-            return ForceOver(
-                nan, nan, ForceSpread(), spans.coverage, position_m, rotation_rad, reason
-            )
+            return ForceOver(nan, nan, ForceSpread(), coverage, position_m, rotation_rad, reason)
         inside = (times >= t0_ns) & (times <= t1_ns)
         std_n, spread = math.nan, ForceSpread()
         if np.count_nonzero(inside & np.isfinite(rows[:, 0])) >= LEAST_WRENCHES:
-            std_n = math.hypot(spans.std_of_mean(), zero_std_n)
+            std_n = math.hypot(batches_n, zero_std_n)
             time_s = (times[inside] - t0_ns) * 1e-9
             spread = spread_of(time_s, rows[inside, 0], (t1_ns - t0_ns) * 1e-9)
-        force_n = float(spans.mean()[0])
-        return ForceOver(force_n, std_n, spread, spans.coverage, position_m, rotation_rad, "")
+        return ForceOver(float(mean[0]), std_n, spread, coverage, position_m, rotation_rad, "")
 
     def _missing(
         self, t0_ns: int, t1_ns: int, now_ns: int, oldest_ns: float, coverage: float
@@ -301,8 +298,10 @@ class ForceRecord:
         return ""
 
 
-class _Spans:
-    """The spans between successive samples that are not too far apart, within an interval.
+def _averages(
+    times_ns: IntArray, values: FloatArray, t0_ns: int, t1_ns: int, longest_ns: float
+) -> tuple[float, FloatArray, float]:
+    """Of the spans between successive samples that are not too far apart, within an interval.
 
     Parameters
     ----------
@@ -314,48 +313,41 @@ class _Spans:
     longest_ns : float
         A longer span says nothing.
 
-    Attributes
-    ----------
+    Returns
+    -------
     coverage : float
         Share of the interval that they cover.
+    mean : (k,) array
+        Weighted by time; NaN where nothing is covered.
+    std_of_mean : float
+        Standard deviation of the first column's mean, from batches of equal covered time.
     """
-
-    def __init__(
-        self, times_ns: IntArray, values: FloatArray, t0_ns: int, t1_ns: int, longest_ns: float
-    ) -> None:
-        # from the beginning of the interval: as floats, times of the clock would lose their last digits
-        t, end = (times_ns - t0_ns).astype(float), float(t1_ns - t0_ns)
-        corners, steps = np.clip(t, 0.0, end), np.diff(t)
-        values = values.copy()
-        if len(steps):  # at the ends of the interval the value is that between two samples
-            first = (corners[0] - t[0]) / steps[0] * (values[1] - values[0])
-            last = (corners[-1] - t[-1]) / steps[-1] * (values[-1] - values[-2])
-            values[0] += first
-            values[-1] += last
-        known = np.isfinite(values[:, 0])
-        self._reference = (
-            values[known.argmax()].copy() if known.any() else np.zeros(values.shape[1])
-        )
-        values -= self._reference
-        lengths, middles = np.diff(corners), (values[:-1] + values[1:]) / 2  # (n - 1,), (n - 1, k)
-        unknown = ~(known[:-1] & known[1:] & (steps <= longest_ns))
-        lengths[unknown], middles[unknown] = 0.0, 0.0
-        # up to the end of each span: time that is covered, and integral of the values over it
-        self._covered_ns = np.concatenate([[0.0], np.cumsum(lengths)])  # (n,)
-        sums = np.cumsum(lengths[:, None] * middles, axis=0)
-        self._sums = np.concatenate([np.zeros((1, values.shape[1])), sums])  # (n, k)
-        self.coverage = float(self._covered_ns[-1] / end)
-
-    def mean(self) -> FloatArray:
-        """Time-weighted mean (k,)."""
-        return self._reference + self._sums[-1] / self._covered_ns[-1]
-
-    def std_of_mean(self) -> float:
-        """Standard deviation of the first column's mean, from batches of equal covered time."""
-        covered, sums = self._covered_ns, self._sums[:, 0]
-        ends = np.linspace(0.0, covered[-1], BATCHES + 1)
-        means = np.diff(np.interp(ends, covered, sums)) / (covered[-1] / BATCHES)
-        return float(means.std(ddof=1) / math.sqrt(BATCHES))
+    # from the beginning of the interval: as floats, times of the clock would lose their last digits
+    t, end = (times_ns - t0_ns).astype(float), float(t1_ns - t0_ns)
+    corners, steps = np.clip(t, 0.0, end), np.diff(t)
+    values = values.copy()
+    if len(steps):  # at the ends of the interval the value is that between two samples
+        first = (corners[0] - t[0]) / steps[0] * (values[1] - values[0])
+        last = (corners[-1] - t[-1]) / steps[-1] * (values[-1] - values[-2])
+        values[0] += first
+        values[-1] += last
+    known = np.isfinite(values[:, 0])
+    reference = values[known.argmax()].copy() if known.any() else np.zeros(values.shape[1])
+    values -= reference
+    lengths, middles = np.diff(corners), (values[:-1] + values[1:]) / 2  # (n - 1,), (n - 1, k)
+    unknown = ~(known[:-1] & known[1:] & (steps <= longest_ns))
+    lengths[unknown], middles[unknown] = 0.0, 0.0
+    # up to the end of each span: time that is covered, and integral of the values over it
+    covered_ns = np.concatenate([[0.0], np.cumsum(lengths)])  # (n,)
+    sums = np.cumsum(lengths[:, None] * middles, axis=0)
+    sums = np.concatenate([np.zeros((1, values.shape[1])), sums])  # (n, k)
+    whole_ns = covered_ns[-1]
+    if whole_ns == 0:
+        return 0.0, np.full(values.shape[1], math.nan), math.nan
+    ends = np.interp(np.linspace(0.0, whole_ns, BATCHES + 1), covered_ns, sums[:, 0])
+    means = np.diff(ends) / (whole_ns / BATCHES)
+    std = float(means.std(ddof=1) / math.sqrt(BATCHES))
+    return float(whole_ns / end), reference + sums[-1] / whole_ns, std
 
 
 def _cut(rows: deque[tuple[float, ...]], t0_ns: int, t1_ns: int) -> list[tuple[float, ...]]:
