@@ -344,8 +344,9 @@ class UrArm:
             with self._reading:  # a loop may wait for a time while another thread connects
                 if states.read(now_known or self.led is None):
                     self.heard_s = time.monotonic()
-        except ConnectionError as error:
-            self._forget()
+        except OSError as error:
+            if states is self._states:  # not where another thread has closed it, and connects anew
+                self._forget()
             text = f"the connection to {self.config.host} is lost"
             raise ArmError(ArmFault.LINK_LOST, text) from error
 

@@ -340,3 +340,20 @@ def test_a_wait_for_a_state_goes_on_with_the_reader_of_a_new_connection():
     waits.join(10.0)
     assert not waits.is_alive()
     assert later.reads < 3  # not without a pause
+
+
+def test_a_connection_that_another_thread_closes_is_lost_and_the_new_one_stays():
+    arm, former, later = UrArm(UrArmConfig("127.0.0.1")), Reader(1.0), Reader(3.0)
+
+    def closed_meanwhile(now_known):
+        arm._states = later
+        former.stream.close()
+        former.stream.recv(1)
+
+    former.read = closed_meanwhile
+    arm._states = former
+    with pytest.raises(ArmError, match="the connection to 127.0.0.1 is lost") as error:
+        arm.receive()
+    assert error.value.fault is ArmFault.LINK_LOST
+    assert arm._states is later
+    assert later.stream.fileno() >= 0
