@@ -146,7 +146,7 @@ class ForceWatch:
 WALL_TIME_S = 0.1
 """Towards a wall of the workspace the tip goes no faster than this brings it there [s]."""
 
-REACTION_S, BRAKING_M_S2 = 0.03, 0.2
+ANSWER_S, BRAKING_M_S2 = 0.03, 0.2
 """The arm answers this late [s] and is trusted to slow down this hard [m/s2] before it is near."""
 
 ROUNDING = 1e-12
@@ -299,7 +299,7 @@ class Envelope:
         speed, most = math.hypot(x, y, z), limits.free_speed_m_s
         if across < -ROUNDING * speed:
             # further up just so fast that it can slow down before it is near
-            room = max(0.0, place.height_m - limits.near_m + REACTION_S * across)
+            room = max(0.0, place.height_m - limits.near_m + ANSWER_S * across)
             most = min(most, math.sqrt(limits.near_speed_m_s**2 + 2 * BRAKING_M_S2 * room))
         share = _shrink(speed, most)
         x, y, z = share * x, share * y, share * z
