@@ -194,7 +194,7 @@ class Client:
         try:
             done = action(*arguments)
         except Exception as error:  # the library documents no exceptions; the owner reads the text
-            print(f"{action}: {error}", file=sys.stderr)
+            print(f"{action.__name__}: {error}", file=sys.stderr)
             done = False
         if not done:
             # a stop that is why shows in the states a cycle or two later than in the refusal
