@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shutil
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -221,7 +222,6 @@ def run_job(job: Job) -> int:
             return 0 if any(of.outcome is PointOutcome.DONE for of in so_far.latest) else 1
     job = replace(job, host=take_domain(job.host))
     require_own_domain()
-    check_signals = noting_signals()
     print(
         f"scan of {content.name}, simulated. To listen: ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} "
         f"ROS_AUTOMATIC_DISCOVERY_RANGE={os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}",
@@ -237,7 +237,7 @@ def run_job(job: Job) -> int:
         parameters["pole_map_node"]["adaptive_scene"] = str(job.scene)
     computing = () if priority or not job.real_time else COMPUTING
     try:
-        with NodeProcesses(work / "log") as nodes:
+        with noting_signals() as check_signals, NodeProcesses(work / "log") as nodes:
             nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
             result = _scan(nodes, job, check_signals)
     # the nodes have ended: whether a run was begun is certain now
@@ -247,10 +247,6 @@ def run_job(job: Job) -> int:
         raise ValueError(f"{error} (logs in {work / 'log'}){way_on}") from error
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(_way_on(job)) from error
-    # no node runs that would have to be ended first, and every file of a report is whole or not there
-    for number in ENDING:
-        signal.signal(number, signal.default_int_handler)
-    check_signals()
     if result.ending is Ending.COMPLETE:  # each simulated record that counts is in the run
         shutil.rmtree(work / "records", ignore_errors=True)
     try:
@@ -292,11 +288,12 @@ def require_own_domain() -> None:
             )
 
 
-def noting_signals() -> Callable[[], None]:
-    """From now on `ENDING` signals take effect only where what is returned is called: they end nodes in order.
+@contextlib.contextmanager
+def noting_signals() -> Iterator[Callable[[], None]]:
+    """`ENDING` signals take effect only where what it gives is called, and at its end: they end nodes in order.
 
-    Even where a shell made this process ignore Ctrl-C. What is returned raises `KeyboardInterrupt` if one has
-    come.
+    Even where a shell made this process ignore Ctrl-C. What it gives raises `KeyboardInterrupt` once for all
+    that have come, so that the end of what is under way may be waited for; later each interrupts at once.
     """
     come: list[int] = []
     for number in ENDING:
@@ -304,9 +301,15 @@ def noting_signals() -> Callable[[], None]:
 
     def check() -> None:
         if come:
+            come.clear()
             raise KeyboardInterrupt
 
-    return check
+    try:
+        yield check
+    finally:
+        for number in ENDING:
+            signal.signal(number, signal.default_int_handler)
+    check()
 
 
 def node_parameters(

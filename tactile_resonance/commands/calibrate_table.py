@@ -149,8 +149,7 @@ def _simulated(
     if wanted["file"]:
         wanted["file"] = Path(wanted["file"]).absolute()
         parameters["scan_node"]["goal_folders"] = [str(wanted["file"].parent)]
-    check_signals = noting_signals()
-    with NodeProcesses(work / "log") as nodes:
+    with noting_signals() as check_signals, NodeProcesses(work / "log") as nodes:
 
         def check() -> None:
             check_signals()
