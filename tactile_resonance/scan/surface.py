@@ -118,8 +118,13 @@ class HeightField(Surface):
 
     @cached_property
     def _spline(self) -> RectBivariateSpline:
-        orders = [min(3, axis.size - 1) for axis in (self.x_m, self.y_m)]
-        return RectBivariateSpline(self.x_m, self.y_m, self.z_m, kx=orders[0], ky=orders[1])
+        x, y, z = self.x_m, self.y_m, self.z_m
+        # a spline of order 1 has no slope in scipy: the middle of two makes it one of order 2
+        if x.size == 2:
+            x, z = np.insert(x, 1, x.mean()), np.insert(z, 1, z.mean(axis=0), axis=0)
+        if y.size == 2:
+            y, z = np.insert(y, 1, y.mean()), np.insert(z, 1, z.mean(axis=1), axis=1)
+        return RectBivariateSpline(x, y, z, kx=min(3, x.size - 1), ky=min(3, y.size - 1))
 
 
 def unit_normal(slope_x: npt.ArrayLike, slope_y: npt.ArrayLike) -> FloatArray:

@@ -55,6 +55,17 @@ def test_height_field_reproduces_a_quadric():
     assert np.isnan(surface.normal([0.0, 0.021])).all()
 
 
+@pytest.mark.parametrize(("columns", "rows"), [(2, 2), (2, 4), (5, 2)])
+def test_height_field_of_two_values_on_an_axis_is_straight_along_it(columns, rows):
+    x, y = np.linspace(-0.03, 0.03, columns), np.linspace(-0.02, 0.02, rows)
+    surface = HeightField(x, y, 0.02 + 0.3 * x[:, None] - 0.1 * y + 2.0 * x[:, None] * y)
+    xy = np.random.default_rng(1).uniform([-0.03, -0.02], [0.03, 0.02], (20, 2))
+    height, normal = surface.at(xy)
+    np.testing.assert_allclose(height, 0.02 + xy @ [0.3, -0.1] + 2.0 * xy.prod(axis=1), rtol=1e-12)
+    slope = [0.3, -0.1] + 2.0 * xy[:, ::-1]
+    np.testing.assert_allclose(-normal[:, :2] / normal[:, 2:], slope, rtol=1e-9, atol=1e-12)
+
+
 def cap(radius_m, steps, flip=False):
     """Triangles of a spherical cap with its pole up, about the origin."""
     polar, turn = np.linspace(0, 1.0, steps), np.linspace(0, 2 * np.pi, 4 * steps + 1)
