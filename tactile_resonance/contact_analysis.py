@@ -68,8 +68,10 @@ def estimate_contact(
         As `tactile_resonance calibrate` writes it.
     band_hz : (low, high), optional
         From .8 to 1.6 times the mode of 100 to 500 Hz in air when absent.
-    force_n, force_std_n : float
+    force_n : float
         Of the contact; NaN: unknown. The moduli need it, the stiffness hardly.
+    force_std_n : float
+        Its standard deviation, 0 or above.
     from_rest : bool
         The sensor was at rest at the first sample, and the record is the first of its excitation. Otherwise two
         periods or more are needed.

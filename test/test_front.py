@@ -192,7 +192,8 @@ def test_lines_that_were_not_driven_are_in_the_message_of_poles_that_are_none(re
     assert poles.status is not tr.PolesStatus.OK
     weak = re.search(r"input less than 10 dB above its noise at (\d+) of 41 lines", poles.message)
     # noise is ten times its own variance, of two degrees of freedom or more, on 3 % of lines at most
-    assert weak and int(weak[1]) > 30
+    assert weak is not None
+    assert int(weak[1]) > 30
 
 
 def test_a_band_without_lines_is_refused_for_recording_and_response_alike(recording):

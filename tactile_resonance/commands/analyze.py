@@ -162,6 +162,7 @@ _OF_POLES = (
     *("distortion", "plot"),
 )
 _OF_CONTACTS = ("force_n", "from_rest", "relaxed_ratio")
+"""Options, by their fields, that only the analysis of poles, or only that of contacts, knows."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -292,7 +293,8 @@ def _check_outputs(options: argparse.Namespace) -> None:
 
 def _check_together(options: argparse.Namespace) -> None:
     """Refuse options that would be passed over."""
-    unused, accepted = _OF_CONTACTS, "one beside --calibration"
+    unused: tuple[str, ...] = _OF_CONTACTS
+    accepted = "one beside --calibration"
     if options.calibration is not None:
         unused, accepted = (*_OF_POLES, "silent"), "one without --calibration"
     elif options.silent:

@@ -28,7 +28,7 @@ def add_option(
         Its name and what stands for its value or values: ``"--order N"``, ``"--band LO HI"``.
     value : object
         The default, of the kind of the values, which help tells after the text unless it is empty or NaN. A
-        kind alone: there is none. False: an option without a value.
+        kind alone: there is none, or one in `more` that the text tells of. False: an option without a value.
     text : str
         For help.
     **more

@@ -43,7 +43,7 @@ DEVIATIONS = 5.0
 FOR_GAIN, ALIKE = 0.8, 0.5
 ABOVE_NOISE = 10.0
 """What realisations differ by, over the power of the noise, from which noise is no reason for it."""
-UNLIKE = (
+_UNLIKE = (
     "the responses of the realisations have nothing in common, which noise does not explain: "
     "actuator and sensor are of different records, or distortion is larger than the response"
 )
@@ -309,7 +309,7 @@ def disagreement(
     pairs, apart = opposed | unequal, _apart(h, coherence, coherent, lines)
     remarks = np.full(len(h), "", object)
     for k in np.flatnonzero(pairs.any(axis=(1, 2)) | apart.any(axis=-1) | unlike):
-        remarks[k] = UNLIKE if unlike[k] else _odd_one(gain[k], pairs[k], np.flatnonzero(apart[k]))
+        remarks[k] = _UNLIKE if unlike[k] else _odd_one(gain[k], pairs[k], np.flatnonzero(apart[k]))
     return remarks, opposed.any(axis=(1, 2)) | unlike
 
 

@@ -12,6 +12,7 @@ was left out.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import shutil
@@ -142,11 +143,14 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         KeyError,
         TypeError,
         EOFError,
-        OSError,
         NotImplementedError,
         zipfile.BadZipFile,
         struct.error,
     ):  # damaged: it is made again
+        return None
+    except OSError as error:
+        if error.errno not in (None, errno.EINVAL):  # a wrong offset in the file is damage, too
+            raise
         return None
     within = low_hz <= band_hz[0] and band_hz[1] <= high_hz
     return KeptBins(tuple(pieces), tuple(content["left_out"])) if within else None

@@ -3,10 +3,8 @@
 
 import csv
 import sys
-import threading
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -165,27 +163,6 @@ def test_times_of_states_are_those_between_their_beginnings():
     times = StateTimes()
     times.take("travel", round(10e9))
     assert times.fields == {}
-
-
-def test_states_may_come_while_another_contact_begins():
-    contact, over = SimpleNamespace(times=StateTimes()), threading.Event()
-
-    def begin_again_and_again():
-        while not over.is_set():
-            contact.times = StateTimes()
-
-    beside = threading.Thread(target=begin_again_and_again)
-    interval_s = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    beside.start()
-    try:
-        for k in range(30_000):
-            contact.times.take("hold", k)
-    finally:
-        over.set()
-        beside.join()
-        sys.setswitchinterval(interval_s)
-    assert set(contact.times.fields) <= set(SPENT)
 
 
 def test_parts_of_the_time_add_up_to_the_points_and_the_time_between_them():
