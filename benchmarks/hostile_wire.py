@@ -22,13 +22,13 @@ from tactile_resonance.drivers.rtde_stream import PORT, RtdeStream
 from tactile_resonance.report.live import LiveServer
 from tactile_resonance.simulation.cell.tcp_bus import SlcanServer, SocketcandServer
 from tactile_resonance.simulation.plant.simulated_robot import (
-    ControlService,
-    DashboardService,
-    ScriptService,
     SimulatedRobot,
+    serve_dashboard,
+    serve_orders,
+    serve_scripts,
 )
 from tactile_resonance.simulation.ur5e.controller import UrController
-from tactile_resonance.simulation.ur5e.reactor import Service
+from tactile_resonance.simulation.ur5e.reactor import Service, Serving
 
 GREETINGS = {b"V": b"\1", b"S": b"\1"}
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,UINT32,UINT32,INT32"
@@ -208,7 +208,8 @@ class _Line:
         return True
 
     def close(self, reset: bool = False) -> None:
-        """Nothing is open."""
+        """Nobody says anything more."""
+        self.is_open = False
 
 
 class _Plant:
@@ -252,7 +253,8 @@ class _Plant:
         """Of one of its ports."""
 
         def read(data: bytes) -> None:
-            service = self._service(name)
+            line = _Line()
+            service = Service(line, self._serving(name, line))
             try:
                 service.received(data)
                 self._robot.controller.step()
@@ -263,17 +265,16 @@ class _Plant:
 
         return read
 
-    def _service(self, name: str) -> Service:
-        robot, line = self._robot, _Line()
+    def _serving(self, name: str, line: _Line) -> Serving:
+        robot = self._robot
         if name == "RTDE":
             return robot.rtde.serve(line)
         if name == "dashboard":
-            return DashboardService(robot.controller, line)
+            return serve_dashboard(robot.controller, line)
         if name == "programs":
-            return ScriptService(robot.controller)
+            return serve_scripts(robot.controller, line)
         if name == "control":
-            return ControlService(line, robot.orders)
+            return serve_orders(robot.orders, line)
         if name == "grants of time":
             return robot.time.serve(line)
-        bus = self._buses[name]
-        return bus.CLIENT(bus, line)
+        return self._buses[name].serve(line)

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import re
 import time
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from binascii import hexlify
 from collections.abc import Callable, Iterable
-from typing import ClassVar
+from dataclasses import dataclass
 
 from tactile_resonance.simulation.cell.transducer import CanFrame
 from tactile_resonance.simulation.plant.bench_time import STALL_S
-from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService, Reactor
+from tactile_resonance.simulation.ur5e.reactor import Connection, Reactor, Serving, Until
 
 LONGEST_QUEUE = 1 << 20
 """Bytes that a client may leave unread before it is dropped."""
@@ -27,35 +27,26 @@ Receiver = Callable[[int, bytes], Iterable[CanFrame]]
 """Takes identifier and data of a frame of the bus; returns those that answer it."""
 
 
-class BusClient(MessageService):
+@dataclass(eq=False)
+class BusClient:
     """One connection.
 
     Attributes
     ----------
+    connection : Connection
     listens_from_s : float or None
         From when on it gets the bus's frames (monotonic clock); None: not yet.
     frames : int
         Of the bus, sent to it.
     """
 
-    def __init__(self, bus: TcpBus, connection: Connection) -> None:
-        super().__init__(connection)
-        self._bus = bus
-        self.listens_from_s: float | None = None
-        self.frames = 0
-
-    @staticmethod
-    @abstractmethod
-    def text_of(frame: CanFrame, epoch_s: float) -> bytes:
-        """A frame of the bus as it is sent; `epoch_s` [s] is the time at time 0 of frames."""
-
-    def closed(self) -> None:
-        """It has gone."""
-        self._bus.clients.discard(self)
+    connection: Connection
+    listens_from_s: float | None = None
+    frames: int = 0
 
 
-class TcpBus:
-    """One bus, any number of clients, served by `CLIENT`.
+class TcpBus(ABC):
+    """One bus, any number of clients.
 
     Parameters
     ----------
@@ -80,13 +71,28 @@ class TcpBus:
         Where the port cannot be had.
     """
 
-    CLIENT: ClassVar[type[BusClient]]
-
     def __init__(self, reactor: Reactor, port: int, receiver: Receiver) -> None:
         self.epoch_s = 0.0
         self.clients: set[BusClient] = set()
         self._receiver = receiver
-        self.port = reactor.listen(port, self._serve, freezable=False, most_unsent=LONGEST_QUEUE)
+        self.port = reactor.listen(port, self.serve, freezable=False, most_unsent=LONGEST_QUEUE)
+
+    def serve(self, connection: Connection) -> Serving:
+        """Serve a new connection, a client until it ends."""
+        client = BusClient(connection)
+        self.clients.add(client)
+        try:
+            yield from self.talk(client)
+        finally:
+            self.clients.discard(client)
+
+    @abstractmethod
+    def talk(self, client: BusClient) -> Serving:
+        """Execute the messages of a client."""
+
+    @abstractmethod
+    def text_of(self, frame: CanFrame) -> bytes:
+        """A frame of the bus as it is sent."""
 
     def take(self, can_id: int, data: bytes) -> None:
         """Hand a client's frame to the cell, and its answer to all."""
@@ -100,8 +106,7 @@ class TcpBus:
             for client in self.clients
             if client.listens_from_s is not None and client.listens_from_s <= now_s
         ]
-        text_of = self.CLIENT.text_of
-        texts = [text_of(frame, self.epoch_s) for frame in frames] if listening else []
+        texts = [self.text_of(frame) for frame in frames] if listening else []
         if not texts:
             return
         text = b"".join(texts)
@@ -124,11 +129,6 @@ class TcpBus:
         for client in list(self.clients):
             client.connection.close()
 
-    def _serve(self, connection: Connection) -> BusClient:
-        client = self.CLIENT(self, connection)
-        self.clients.add(client)
-        return client
-
 
 CHANNEL = "can0"
 """Of a socketcand server."""
@@ -139,41 +139,40 @@ QUIET_S = 0.05
 """Clients read their last `ok` in one piece: no frame follows it for this long, or until they speak."""
 
 
-class _SocketcandClient(BusClient):
-    END = b">"
+class SocketcandServer(TcpBus):
+    """The bus `CHANNEL`; see `TcpBus`."""
 
-    def __init__(self, bus: TcpBus, connection: Connection) -> None:
-        super().__init__(bus, connection)
-        self.connection.send(b"< hi >")
-
-    @staticmethod
-    def text_of(frame: CanFrame, epoch_s: float) -> bytes:
+    def text_of(self, frame: CanFrame) -> bytes:
         """As it is sent, with its time."""
         text = hexlify(frame.data).upper()
-        return b"< frame %03X %.6f %s >" % (frame.can_id, epoch_s + frame.time_s, text)
+        return b"< frame %03X %.6f %s >" % (frame.can_id, self.epoch_s + frame.time_s, text)
 
-    def understand(self, message: bytes) -> None:
-        """Execute one message."""
-        words = message.strip(b"< \r\n").decode("ascii", "replace").split()
-        if not words:
-            return
-        if words[0] == "send" and self.listens_from_s is not None:
-            frame = _socketcand_frame(words[1:])
-            if frame is None:
-                self.connection.send(b"< error syntax of send >")
-                return
-            self.listens_from_s = time.monotonic()
-            self._bus.take(*frame)
-        elif words[0] == "open" and words[1:] != [CHANNEL]:
-            self.connection.send(b"< error could not open bus >")
-        elif words[0] in ("open", "rawmode"):
-            self.connection.send(b"< ok >")
-            if words[0] == "rawmode":
-                self.listens_from_s = time.monotonic() + QUIET_S
-        elif words[0] == "echo":
-            self.connection.send(b"< echo >")
-        else:
-            self.connection.send(b"< error unknown command >")
+    def talk(self, client: BusClient) -> Serving:
+        """Execute the messages of a client."""
+        send = client.connection.send
+        send(b"< hi >")
+        while True:
+            message = yield Until(b">")
+            words = message.strip(b"< \r\n").decode("ascii", "replace").split()
+            if not words:
+                continue
+            if words[0] == "send" and client.listens_from_s is not None:
+                frame = _socketcand_frame(words[1:])
+                if frame is None:
+                    send(b"< error syntax of send >")
+                    continue
+                client.listens_from_s = time.monotonic()
+                self.take(*frame)
+            elif words[0] == "open" and words[1:] != [CHANNEL]:
+                send(b"< error could not open bus >")
+            elif words[0] in ("open", "rawmode"):
+                send(b"< ok >")
+                if words[0] == "rawmode":
+                    client.listens_from_s = time.monotonic() + QUIET_S
+            elif words[0] == "echo":
+                send(b"< echo >")
+            else:
+                send(b"< error unknown command >")
 
 
 def _socketcand_frame(words: list[str]) -> tuple[int, bytes] | None:
@@ -186,47 +185,42 @@ def _socketcand_frame(words: list[str]) -> tuple[int, bytes] | None:
     return can_id, bytes(data)
 
 
-class SocketcandServer(TcpBus):
-    """The bus `CHANNEL`; see `TcpBus`."""
-
-    CLIENT = _SocketcandClient
-
-
 OK, FAILED = b"\r", b"\a"
 _FRAME = re.compile(r"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 
 
-class _SlcanClient(BusClient):
-    END = b"\r"
+class SlcanServer(TcpBus):
+    """See `TcpBus`. Frames carry no time stamps."""
 
-    @staticmethod
-    def text_of(frame: CanFrame, epoch_s: float) -> bytes:
+    def text_of(self, frame: CanFrame) -> bytes:
         """As it is sent, without a time."""
         return b"t%03X%d%s\r" % (frame.can_id, len(frame.data), frame.data.hex().upper().encode())
 
-    def understand(self, message: bytes) -> None:
-        """Execute one line."""
-        line = message.decode("ascii", "replace")
-        command = line[:1]
-        if command in ("S", "s"):  # while it listens the speed stays as it is
-            self.connection.send(OK if self.listens_from_s is None else FAILED)
-        elif command in ("O", "L"):
-            self.listens_from_s = time.monotonic()
-            self.connection.send(OK)
-        elif command == "C":
-            self.listens_from_s = None
-            self.connection.send(OK)
-        elif command == "t":
-            frame = _slcan_frame(line)
-            if frame is None or self.listens_from_s is None:
-                self.connection.send(FAILED)
+    def talk(self, client: BusClient) -> Serving:
+        """Execute the lines of a client."""
+        send = client.connection.send
+        while True:
+            line = (yield Until(b"\r")).decode("ascii", "replace")
+            command = line[:1]
+            if command in ("S", "s"):  # while it listens the speed stays as it is
+                send(OK if client.listens_from_s is None else FAILED)
+            elif command in ("O", "L"):
+                client.listens_from_s = time.monotonic()
+                send(OK)
+            elif command == "C":
+                client.listens_from_s = None
+                send(OK)
+            elif command == "t":
+                frame = _slcan_frame(line)
+                if frame is None or client.listens_from_s is None:
+                    send(FAILED)
+                else:
+                    send(b"z" + OK)
+                    self.take(*frame)
+            elif command in ("V", "N"):
+                send(command.encode() + b"0000" + OK)
             else:
-                self.connection.send(b"z" + OK)
-                self._bus.take(*frame)
-        elif command in ("V", "N"):
-            self.connection.send(command.encode() + b"0000" + OK)
-        else:
-            self.connection.send(FAILED)
+                send(FAILED)
 
 
 def _slcan_frame(line: str) -> tuple[int, bytes] | None:
@@ -236,9 +230,3 @@ def _slcan_frame(line: str) -> tuple[int, bytes] | None:
         return None
     data = bytes.fromhex(found[3])
     return (int(found[1], 16), data) if len(data) == int(found[2]) else None
-
-
-class SlcanServer(TcpBus):
-    """See `TcpBus`. Frames carry no time stamps."""
-
-    CLIENT = _SlcanClient

@@ -11,9 +11,10 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from tactile_resonance.clock import ENDLESS_NS, MESSAGE, Demand, FromBench, ToBench
-from tactile_resonance.simulation.ur5e.reactor import Connection, Reactor
+from tactile_resonance.simulation.ur5e.reactor import Connection, Reactor, Serving, Until
 
 START_NS = 1_000_000_000
 """Time at which a bench begins [ns]; not 0, which in ROS means that no time is known."""
@@ -23,77 +24,27 @@ REPEAT_S = 0.05
 """While time stands the newest data are sent again after so long, on this machine's clock [s]."""
 PACKETS_WITHIN_S = 0.5
 """A packet that was announced is waited for so long, on this machine's clock [s]."""
-_LONGEST_JOIN = 4096
 
 
+@dataclass(eq=False)
 class Participant:
-    """One connection of a participant."""
+    """One connection of a participant; see `tactile_resonance.clock.SimulatedClock`."""
 
-    def __init__(self, keeper: BenchTime, connection: Connection) -> None:
-        self._keeper, self._connection = keeper, connection
-        self._buffer = b""
-        self.joined = False
-        self.name = self.told_with = ""
-        self.hands_over = self.conducts = False
-        self.until_ns, self.demand = ENDLESS_NS, Demand.NONE
-        self.told_ns = -1  # until_ns that was reported to it
-        self.wake_ns = ENDLESS_NS
-        self.robot_port = self.bus_port = 0
-
-    def received(self, data: bytes) -> None:
-        """Take what was sent; ValueError where it is not a message."""
-        self._buffer += data
-        if not self.joined:
-            line, end, rest = self._buffer.partition(b"\n")
-            if not end:
-                if len(line) > _LONGEST_JOIN:
-                    raise ValueError("time: no line ends")
-                return
-            try:
-                self._join(json.loads(line))
-            except RecursionError as error:
-                raise ValueError("time: nested too deeply") from error
-            self._buffer = rest
-        while len(self._buffer) >= MESSAGE.size:
-            kind, a, b, c = MESSAGE.unpack_from(self._buffer)
-            self._buffer = self._buffer[MESSAGE.size :]
-            self._take(ToBench(kind), a, b, c)
-
-    def closed(self) -> None:
-        """A participant that has disconnected holds time up no longer."""
-        self._keeper.leave(self)
+    connection: Connection
+    name: str
+    told_with: str
+    hands_over: bool
+    conducts: bool
+    until_ns: int = ENDLESS_NS
+    demand: Demand = Demand.NONE
+    told_ns: int = -1  # until_ns that was reported to it
+    wake_ns: int = ENDLESS_NS
+    robot_port: int = 0
+    bus_port: int = 0
 
     def tell(self, kind: FromBench, now_ns: int, robot_ns: int = 0, frames: int = 0) -> None:
         """Send a time."""
-        self._connection.send(MESSAGE.pack(kind, now_ns, robot_ns, frames))
-
-    def _join(self, fields: object) -> None:
-        if not isinstance(fields, dict) or "name" not in fields:
-            raise ValueError("time: no name")
-        self.name, self.told_with = str(fields["name"]), str(fields.get("with", ""))
-        self.hands_over = fields.get("hands_over") is True
-        self.conducts = fields.get("conducts") is True
-        self.joined = True
-        self._keeper.join(self)
-
-    def _take(self, kind: ToBench, a: int, b: int, c: int) -> None:
-        keeper = self._keeper
-        if kind is ToBench.HOLD:
-            self.until_ns, self.demand, self.told_ns = a, Demand(b), -1
-            keeper.expect(c)
-            keeper.tell_reached()
-        elif kind is ToBench.WAKE:
-            self.wake_ns = a
-            keeper.tell_reached()
-        elif kind is ToBench.ASK:
-            self.tell(FromBench.TIME, keeper.now_ns)
-        elif kind is ToBench.GO:
-            self.until_ns = ENDLESS_NS
-        elif kind is ToBench.SEED:
-            for call in keeper.seeds:
-                call((a, b, c))
-        else:
-            self.robot_port, self.bus_port = a, b
+        self.connection.send(MESSAGE.pack(kind, now_ns, robot_ns, frames))
 
 
 class BenchTime:
@@ -159,21 +110,49 @@ class BenchTime:
 
     # participants
 
-    def serve(self, connection: Connection) -> Participant:
-        """Serve a new connection."""
-        return Participant(self, connection)
-
-    def join(self, participant: Participant) -> None:
-        """Add a participant."""
+    def serve(self, connection: Connection) -> Serving:
+        """Serve a new connection: a line that says who joins, then messages; who has gone holds up no time."""
+        try:
+            fields = json.loads((yield Until(b"\n", longest=4096)))
+        except RecursionError as error:
+            raise ValueError("time: nested too deeply") from error
+        if not isinstance(fields, dict) or "name" not in fields:
+            raise ValueError("time: no name")
+        participant = Participant(
+            connection,
+            name=str(fields["name"]),
+            told_with=str(fields.get("with", "")),
+            hands_over=fields.get("hands_over") is True,
+            conducts=fields.get("conducts") is True,
+        )
         self._participants.append(participant)
-        self.tell_reached()
-
-    def leave(self, participant: Participant) -> None:
-        """Remove a participant."""
-        if participant in self._participants:
+        try:
+            self.tell_reached()
+            while True:
+                kind, *integers = MESSAGE.unpack((yield MESSAGE.size))
+                self._take(participant, ToBench(kind), *integers)
+        finally:
             self._participants.remove(participant)
 
-    def expect(self, packets: int) -> None:
+    def _take(self, participant: Participant, kind: ToBench, a: int, b: int, c: int) -> None:
+        if kind is ToBench.HOLD:
+            participant.until_ns, participant.demand, participant.told_ns = a, Demand(b), -1
+            self._expect(c)
+            self.tell_reached()
+        elif kind is ToBench.WAKE:
+            participant.wake_ns = a
+            self.tell_reached()
+        elif kind is ToBench.ASK:
+            participant.tell(FromBench.TIME, self.now_ns)
+        elif kind is ToBench.GO:
+            participant.until_ns = ENDLESS_NS
+        elif kind is ToBench.SEED:
+            for call in self.seeds:
+                call((a, b, c))
+        else:
+            participant.robot_port, participant.bus_port = a, b
+
+    def _expect(self, packets: int) -> None:
         """Make no step before so many packets have come since 0 was stated; below 0 nothing is stated."""
         if packets < 0:
             return

@@ -29,82 +29,66 @@ from tactile_resonance.simulation.ur5e.controller import (
     RefusedError,
     UrController,
 )
-from tactile_resonance.simulation.ur5e.reactor import Connection, MessageService, Reactor
+from tactile_resonance.simulation.ur5e.reactor import Connection, Reactor, Serving, Until
 from tactile_resonance.simulation.ur5e.target import CYCLE_S
 
 DASHBOARD_PORT = 29999
+_REQUEST = Until(b"\n", 4096)
 # What a robot in local control answers to everything that changes its state.
 _LOCAL = "Command is not allowed: the robot is not in remote control"
 
 
-class DashboardService(MessageService):
-    """One dashboard connection."""
+def serve_dashboard(controller: UrController, connection: Connection) -> Serving:
+    """Serve one dashboard connection: each line is answered by one."""
+    c, safety = controller, controller.safety
+    # asked at any time
+    questions: dict[str, Callable[[], str]] = {
+        "robotmode": lambda: f"Robotmode: {safety.robot_mode.name}",
+        "safetymode": lambda: f"Safetymode: {safety.safety_mode.name}",
+        "safetystatus": lambda: f"Safetystatus: {safety.safety_mode.name}",
+        "programState": lambda: f"{'PLAYING' if c.program else 'STOPPED'} rtde_control",
+        "running": lambda: f"Program running: {str(c.program is not None).lower()}",
+        "is in remote control": lambda: str(c.remote_control).lower(),
+        "isProgramSaved": lambda: "true",
+        "get loaded program": lambda: "No program loaded",
+        "get robot model": lambda: "UR5",
+        "get serial number": lambda: SERIAL_NUMBER,
+        "PolyscopeVersion": lambda: f"URSoftware {'.'.join(map(str, POLYSCOPE))}",
+        "version": lambda: ".".join(map(str, POLYSCOPE)),
+        "quit": lambda: "Disconnected",
+    }
+    actions: dict[str, tuple[Callable[[], None], str]] = {
+        "power on": (safety.power_on, "Powering on"),
+        "power off": (c.power_off, "Powering off"),
+        "brake release": (safety.brake_release, "Brake releasing"),
+        "unlock protective stop": (safety.unlock_protective_stop, "Protective stop releasing"),
+        "restart safety": (lambda: None, "Restarting safety"),
+        "close popup": (c.close_popup, "closing popup"),
+        "close safety popup": (c.close_popup, "closing safety popup"),
+        "stop": (c.stop_program, "Stopped"),
+        "shutdown": (c.power_off, "Shutting down"),
+    }
 
-    LONGEST = 4096
-
-    def __init__(self, controller: UrController, connection: Connection) -> None:
-        super().__init__(connection)
-        connection.send(b"Connected: Universal Robots Dashboard Server\n")
-        self._controller = c = controller
-        # asked at any time
-        self._questions: dict[str, Callable[[], str]] = {
-            "robotmode": lambda: f"Robotmode: {c.safety.robot_mode.name}",
-            "safetymode": lambda: f"Safetymode: {c.safety.safety_mode.name}",
-            "safetystatus": lambda: f"Safetystatus: {c.safety.safety_mode.name}",
-            "programState": lambda: f"{'PLAYING' if c.program else 'STOPPED'} rtde_control",
-            "running": lambda: f"Program running: {str(c.program is not None).lower()}",
-            "is in remote control": lambda: str(c.remote_control).lower(),
-            "isProgramSaved": lambda: "true",
-            "get loaded program": lambda: "No program loaded",
-            "get robot model": lambda: "UR5",
-            "get serial number": lambda: SERIAL_NUMBER,
-            "PolyscopeVersion": lambda: f"URSoftware {'.'.join(map(str, POLYSCOPE))}",
-            "version": lambda: ".".join(map(str, POLYSCOPE)),
-        }
-        self._actions: dict[str, tuple[Callable[[], None], str]] = {
-            "power on": (c.safety.power_on, "Powering on"),
-            "power off": (c.power_off, "Powering off"),
-            "brake release": (c.safety.brake_release, "Brake releasing"),
-            "unlock protective stop": (
-                c.safety.unlock_protective_stop,
-                "Protective stop releasing",
-            ),
-            "restart safety": (lambda: None, "Restarting safety"),
-            "close popup": (c.close_popup, "closing popup"),
-            "close safety popup": (c.close_popup, "closing safety popup"),
-            "stop": (c.stop_program, "Stopped"),
-            "shutdown": (c.power_off, "Shutting down"),
-        }
-
-    def understand(self, message: bytes) -> None:
-        """Answer one line."""
-        request = message.decode("utf-8", "replace").strip()
-        self.connection.send((self._answer(request) + "\n").encode())
-        if request == "quit":
-            self.connection.close()
-
-    def _answer(self, request: str) -> str:
-        if request in self._questions:
-            return self._questions[request]()
-        if request == "quit":
-            return "Disconnected"
+    def answer(request: str) -> str:
+        if request in questions:
+            return questions[request]()
         word, _, rest = request.partition(" ")
         if word == "addToLog":
-            self._controller.log.append(rest)
+            c.log.append(rest)
             return "Added log message"
         if word == "setUserRole":
             return f"Setting user role: {rest}"
-        if not self._controller.remote_control:
+        if not c.remote_control:
             return _LOCAL
-        if request in self._actions:
-            action, answer = self._actions[request]
+        if request in actions:
+            action, done = actions[request]
             try:
                 action()
             except RefusedError as error:
                 return str(error)
-            return answer
+            return done
         if word == "popup":
-            self._controller.popup = rest
+            c.popup = rest
             return "showing popup"
         if word == "load":
             return f"File not found: {rest}"
@@ -112,37 +96,33 @@ class DashboardService(MessageService):
             return f"Failed to execute: {request}"
         return f"could not understand: '{request}'"
 
+    connection.send(b"Connected: Universal Robots Dashboard Server\n")
+    request = ""
+    while request != "quit":
+        request = (yield _REQUEST).decode("utf-8", "replace").strip()
+        connection.send((answer(request) + "\n").encode())
 
-class ControlService(MessageService):
-    """One connection to the control port.
 
-    Parameters
-    ----------
-    connection : Connection
-    orders : dict
-        Name of each command and the function that does it: takes the fields of the request, returns
-        those of the answer, raises ValueError where it refuses.
-    """
+Orders = dict[str, Callable[[dict], dict]]
+"""Name of each command and the function that does it: takes the fields of the request, returns those of the
+answer, raises ValueError where it refuses."""
 
-    def __init__(self, connection: Connection, orders: dict[str, Callable[[dict], dict]]) -> None:
-        super().__init__(connection)
-        self._orders = orders
 
-    def understand(self, message: bytes) -> None:
-        """Answer one line."""
-        self.connection.send(json.dumps(self._answer(message)).encode() + b"\n")
-
-    def _answer(self, line: bytes) -> dict:
+def serve_orders(orders: Orders, connection: Connection) -> Serving:
+    """Serve one connection to the control port."""
+    while True:
+        line = yield Until(b"\n")
         try:
             fields = json.loads(line)
             name = fields.get("command") if isinstance(fields, dict) else None
-            if not isinstance(name, str) or name not in self._orders:
-                raise ValueError(f"command: expected one of {', '.join(self._orders)}")
-            return {"ok": True, **self._orders[name](fields)}
+            if not isinstance(name, str) or name not in orders:
+                raise ValueError(f"command: expected one of {', '.join(orders)}")
+            answer = {"ok": True, **orders[name](fields)}
         except RecursionError:
-            return {"ok": False, "error": "request: nested too deeply"}
+            answer = {"ok": False, "error": "request: nested too deeply"}
         except ValueError as error:
-            return {"ok": False, "error": str(error)}
+            answer = {"ok": False, "error": str(error)}
+        connection.send(json.dumps(answer).encode() + b"\n")
 
 
 # Programs come in here, nothing goes out: a real controller also sends its state, which no client of this
@@ -154,30 +134,24 @@ _LONGEST_PROGRAM = 1 << 18
 _END = re.compile(rb"^end[ \t]*\r?\n", re.MULTILINE)
 
 
-class ScriptService:
-    """Collects a program and hands it to the controller."""
-
-    def __init__(self, controller: UrController) -> None:
-        self._controller = controller
-        self._buffer = b""
-
-    def received(self, data: bytes) -> None:
-        """Start each program that is complete; what is refused goes to the controller's log."""
-        self._buffer += data
-        if len(self._buffer) > _LONGEST_PROGRAM:
-            raise ValueError(f"script: longer than {_LONGEST_PROGRAM} bytes")
-        while (end := _END.search(self._buffer)) is not None:
-            text, self._buffer = self._buffer[: end.end()], self._buffer[end.end() :]
-            try:
-                self._controller.start_program(text.decode("utf-8", "replace"))
-            except (ValueError, RefusedError) as error:
-                self._controller.log.append(str(error))
-
-    def closed(self) -> None:
-        """An unfinished program is forgotten, and that is logged."""
-        if self._buffer.strip():
-            begin = self._buffer[:40].decode("utf-8", "replace")
-            self._controller.log.append(f"program: got {begin!r}... and no line 'end': ignored")
+def serve_scripts(controller: UrController, _: Connection) -> Serving:
+    """Start each program that is complete; what is refused or stays unfinished goes to the controller's log."""
+    unfinished = b""
+    try:
+        while True:
+            unfinished += yield None
+            if len(unfinished) > _LONGEST_PROGRAM:
+                raise ValueError(f"script: longer than {_LONGEST_PROGRAM} bytes")
+            while (end := _END.search(unfinished)) is not None:
+                text, unfinished = unfinished[: end.end()], unfinished[end.end() :]
+                try:
+                    controller.start_program(text.decode("utf-8", "replace"))
+                except (ValueError, RefusedError) as error:
+                    controller.log.append(str(error))
+    finally:
+        if unfinished.strip():
+            begin = unfinished[:40].decode("utf-8", "replace")
+            controller.log.append(f"program: got {begin!r}... and no line 'end': ignored")
 
 
 _LONGEST_FREEZE_S = 600.0
@@ -204,8 +178,8 @@ class SimulatedRobot:
     controller : UrController
     reactor : Reactor
     rtde : RtdeServer
-    orders : dict
-        What the control port does, by its name; parts of the plant add their own (`ControlService`).
+    orders : Orders
+        What the control port does, by its name; parts of the plant add their own.
     time : BenchTime
     after_step : list of callables
         Called after each step of the controller: what shares its clock.
@@ -240,11 +214,9 @@ class SimulatedRobot:
         self.time.packets_arrived = lambda: None if self.reactor.frozen else self.rtde.packets
         try:
             self.reactor.listen(rtde_server.PORT, self.rtde.serve)
-            self.reactor.listen(DASHBOARD_PORT, partial(DashboardService, controller))
-            self.reactor.listen(SCRIPT_PORT, lambda _: ScriptService(controller))
-            self.reactor.listen(
-                control_port, partial(ControlService, orders=self.orders), freezable=False
-            )
+            self.reactor.listen(DASHBOARD_PORT, partial(serve_dashboard, controller))
+            self.reactor.listen(SCRIPT_PORT, partial(serve_scripts, controller))
+            self.reactor.listen(control_port, partial(serve_orders, self.orders), freezable=False)
             if simulated_time:
                 self.reactor.listen(TIME_PORT, self.time.serve, freezable=False)
         except ValueError:
@@ -277,7 +249,7 @@ class SimulatedRobot:
         """The robot's time stamps go on with the wall clock, as if packets had been lost."""
         self.controller.stood_still_s += seconds
 
-    def _own_orders(self) -> dict[str, Callable[[dict], dict]]:
+    def _own_orders(self) -> Orders:
         """What the control port does for the robot itself."""
         controller, rtde = self.controller, self.rtde
         return {

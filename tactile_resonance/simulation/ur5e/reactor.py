@@ -6,10 +6,10 @@ from __future__ import annotations
 import select
 import socket
 import struct
-from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Generator
+from inspect import GEN_RUNNING, getgeneratorstate
+from typing import NamedTuple
 
 # What a client may leave unread before it is closed, where its port says nothing else: about 0.2 s of all
 # RTDE variables.
@@ -20,16 +20,67 @@ MOST_CONNECTIONS = 100
 MOST_AT_ONCE = 4096
 
 
-class Service(Protocol):
-    """Serves one connection."""
+class Until(NamedTuple):
+    """A message that ends with something; the connection is closed after so many bytes without it."""
+
+    end: bytes
+    longest: int = 1 << 16
+
+
+Serving = Generator[Until | int | None, bytes, None]
+"""Serves one connection, message by message.
+
+It yields what ends the next message, or how many bytes it has, or None for whatever comes next, and is sent
+that message. It raises ValueError where one makes no sense, and returns to close the connection; it is closed
+with the connection, however that ends.
+"""
+
+
+class Service:
+    """Cuts what comes on a connection into the messages that its generator asks for.
+
+    Parameters
+    ----------
+    connection : Connection
+    serving : Serving
+        Begins at once.
+    """
+
+    def __init__(self, connection: Connection, serving: Serving) -> None:
+        self._connection, self._serving = connection, serving
+        self._buffer = b""
+        self._wanted = next(serving)
+        if not connection.is_open:  # its greeting found nobody
+            serving.close()
 
     def received(self, data: bytes) -> None:
-        """Take bytes as they come; raises ValueError where they make no sense."""
-        ...
+        """Hand over each whole message; ValueError where one has no end or makes no sense."""
+        self._buffer += data
+        while self._connection.is_open:
+            wanted, rest = self._wanted, self._buffer
+            whole: bytes | bool
+            if isinstance(wanted, Until):
+                message, whole, rest = rest.partition(wanted.end)
+                if not whole and len(message) > wanted.longest:
+                    raise ValueError(f"port {self._connection.port}: a message without end")
+            elif wanted is None:
+                message, whole, rest = rest, rest, b""
+            else:
+                message, whole, rest = rest[:wanted], len(rest) >= wanted, rest[wanted:]
+            if not whole:
+                break
+            self._buffer = rest
+            try:
+                self._wanted = self._serving.send(message)
+            except StopIteration:
+                self._connection.close()
+        else:
+            self._serving.close()
 
     def closed(self) -> None:
-        """Forget the connection."""
-        ...
+        """End the generator; where it is what closes the connection, it ends with its message."""
+        if getgeneratorstate(self._serving) != GEN_RUNNING:
+            self._serving.close()
 
 
 class Connection:
@@ -143,41 +194,12 @@ class Connection:
             self.service.closed()
 
 
-class MessageService(ABC):
-    """Serves one connection message by message, each of them ended by `END`."""
-
-    END = b"\n"
-    LONGEST = 1 << 16
-    """Bytes without the end of a message, beyond which the connection is closed."""
-
-    def __init__(self, connection: Connection) -> None:
-        self.connection = connection
-        self._buffer = b""
-
-    def received(self, data: bytes) -> None:
-        """Execute each whole message; ValueError where one has no end."""
-        *messages, self._buffer = (self._buffer + data).split(self.END)
-        for message in messages:
-            if self.connection.is_open:
-                self.understand(message)
-        if len(self._buffer) > self.LONGEST:
-            raise ValueError(f"port {self.connection.port}: a message without end")
-
-    @abstractmethod
-    def understand(self, message: bytes) -> None:
-        """Execute one message."""
-
-    def closed(self) -> None:
-        """Forget the connection: by default there is nothing to free."""
-        return None
-
-
 class _Listener(NamedTuple):
     """One port."""
 
     channel: socket.socket
     port: int
-    serve: Callable[[Connection], Service]
+    serve: Callable[[Connection], Serving]
     freezable: bool
     most_unsent: int
 
@@ -227,11 +249,11 @@ class Reactor:
     def listen(
         self,
         port: int,
-        serve: Callable[[Connection], Service],
+        serve: Callable[[Connection], Serving],
         freezable: bool = True,
         most_unsent: int = MOST_UNSENT,
     ) -> int:
-        """Listen on a port, 0 for a free one; `serve` makes the service of each connection.
+        """Listen on a port, 0 for a free one; `serve` begins to serve a connection.
 
         Returns
         -------
@@ -312,7 +334,7 @@ class Reactor:
         except OSError:  # gone again already
             return
         self._connections.add(connection)
-        connection.service = listener.serve(connection)
+        connection.service = Service(connection, listener.serve(connection))
         self.renew()
 
     def renew(self) -> None:

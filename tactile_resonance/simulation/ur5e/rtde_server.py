@@ -8,17 +8,18 @@ Packets are big-endian: size of the packet with its header (u16), type (u8), pay
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
 from tactile_resonance.simulation.ur5e.controller import POLYSCOPE, UrController
-from tactile_resonance.simulation.ur5e.reactor import Connection
+from tactile_resonance.simulation.ur5e.reactor import Connection, Serving
 from tactile_resonance.simulation.ur5e.variables import INPUT_TYPES, OUTPUTS, Reader
 
 PROTOCOL_VERSION = 2
-LONGEST_PAYLOAD = 0xFFFF - 3
+HEADER = struct.Struct(">HB")
+LONGEST_PAYLOAD = 0xFFFF - HEADER.size
 
 # type -> struct code and count
 _LAYOUT = {
@@ -52,33 +53,7 @@ def packet(kind: Kind, payload: bytes) -> bytes:
     """Return a packet with its header; ValueError where it does not fit into one."""
     if len(payload) > LONGEST_PAYLOAD:
         raise ValueError(f"RTDE packet: {len(payload)} bytes, expected at most {LONGEST_PAYLOAD}")
-    return struct.pack(">HB", 3 + len(payload), kind) + payload
-
-
-class PacketReader:
-    """Cuts a stream of bytes into packets."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    def add(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Yield the type and payload of each packet that is complete.
-
-        Raises
-        ------
-        ValueError
-            Where a size is smaller than a header.
-        """
-        self._buffer += data
-        while len(self._buffer) >= 3:
-            size, kind = struct.unpack_from(">HB", self._buffer)
-            if size < 3:
-                raise ValueError(f"RTDE packet: size {size}, expected at least 3")
-            if len(self._buffer) < size:
-                return
-            payload = bytes(self._buffer[3:size])
-            del self._buffer[:size]
-            yield kind, payload
+    return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
 class Layout:
@@ -151,60 +126,62 @@ class RtdeServer:
         self.controller = controller
         self.registers_in_use = False
         self.packets = 0
-        self._services: list[_Service] = []
+        self._clients: list[_Client] = []
 
-    def serve(self, connection: Connection) -> _Service:
-        """Serve a new connection."""
-        service = _Service(self, connection)
-        self._services.append(service)
-        return service
+    def serve(self, connection: Connection) -> Serving:
+        """Serve a new connection, and free what it held when it ends."""
+        client = _Client(self, connection)
+        self._clients.append(client)
+        try:
+            while True:
+                size, kind = HEADER.unpack((yield HEADER.size))
+                if size < HEADER.size:
+                    raise ValueError(f"RTDE packet: size {size}, expected at least {HEADER.size}")
+                client.take(kind, (yield size - HEADER.size))
+        finally:
+            self._clients.remove(client)
 
     @property
     def connections(self) -> int:
         """How many clients are connected."""
-        return len(self._services)
+        return len(self._clients)
 
     def publish(self, cycle: int) -> None:
         """Send this cycle's outputs to whom they are due."""
         known: dict[tuple[str, ...], bytes] = {}  # what several clients ask for is computed once
-        for service in list(self._services):
-            service.publish(cycle, known)
+        for client in list(self._clients):
+            client.publish(cycle, known)
 
     def repeat(self) -> None:
         """Send what was sent last again: clients take a silent robot for lost."""
-        for service in list(self._services):
-            service.repeat()
+        for client in list(self._clients):
+            client.repeat()
 
     def sent_ns(self, port: int) -> int:
         """Time stamp [ns] of the newest outputs that were sent to a client's port; 0: none."""
-        return max((s.sent_ns for s in self._services if s.connection.peer_port == port), default=0)
+        return max((c.sent_ns for c in self._clients if c.connection.peer_port == port), default=0)
 
     def drop(self) -> int:
         """Abort all connections; returns how many there were."""
-        services = list(self._services)
-        for service in services:
-            service.connection.close(reset=True)
-        return len(services)
+        clients = list(self._clients)
+        for client in clients:
+            client.connection.close(reset=True)
+        return len(clients)
 
-    def forget(self, service: _Service) -> None:
-        """Free what a connection held."""
-        self._services.remove(service)
-
-    def claimed(self, name: str, asking: _Service) -> bool:
+    def claimed(self, name: str, asking: _Client) -> bool:
         """Whether another connection, or a fieldbus, writes an input."""
         if self.registers_in_use and "register" in name:
             return True
-        return any(name in service.inputs for service in self._services if service is not asking)
+        return any(name in client.inputs for client in self._clients if client is not asking)
 
 
-class _Service:
+class _Client:
     """One RTDE connection: its recipes, and whether it is started."""
 
     def __init__(self, server: RtdeServer, connection: Connection) -> None:
         self.connection = connection
         self.inputs: set[str] = set()
         self._server = server
-        self._reader = PacketReader()
         self._recipes: dict[int, _Recipe] = {}
         self._outputs: _Recipe | None = None
         self._period = 1
@@ -220,20 +197,15 @@ class _Service:
             Kind.PAUSE: self._pause,
         }
 
-    def received(self, data: bytes) -> None:
-        """Answer requests and take inputs."""
-        for kind, payload in self._reader.add(data):
-            if kind == Kind.DATA:
-                self._take(payload)
-            elif kind in self._answers:
-                kind = Kind(kind)
-                self.connection.send(packet(kind, self._answers[kind](payload)))
-            elif kind != Kind.TEXT:
-                raise ValueError(f"RTDE packet: type {kind}, expected one of 'VvMUOISP'")
-
-    def closed(self) -> None:
-        """Free the inputs."""
-        self._server.forget(self)
+    def take(self, kind: int, payload: bytes) -> None:
+        """Answer a request, or take inputs."""
+        if kind == Kind.DATA:
+            self._take_inputs(payload)
+        elif kind in self._answers:
+            kind = Kind(kind)
+            self.connection.send(packet(kind, self._answers[kind](payload)))
+        elif kind != Kind.TEXT:
+            raise ValueError(f"RTDE packet: type {kind}, expected one of 'VvMUOISP'")
 
     def publish(self, cycle: int, known: dict[tuple[str, ...], bytes]) -> None:
         """Send the outputs where they are due; a client that does not read misses them.
@@ -301,7 +273,7 @@ class _Service:
         self._started = self.connection.patient = False
         return b"\x01"
 
-    def _take(self, payload: bytes) -> None:
+    def _take_inputs(self, payload: bytes) -> None:
         recipe = self._recipes.get(payload[0]) if payload else None
         if recipe is None:
             return

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_resonance.simulation.ur5e.rtde_server import Kind, Layout, PacketReader, packet
+from tactile_resonance.simulation.ur5e.rtde_server import HEADER, Kind, Layout, packet
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 VALUES = {
@@ -32,22 +32,11 @@ VALUES = {
 def test_data_packets_carry_what_was_packed(fields):
     layout = Layout([kind for kind, _ in fields])
     data = layout.pack(7, [value for _, value in fields])
-    ((kind, payload),) = PacketReader().add(data)
-    assert kind == Kind.DATA
+    payload = data[HEADER.size :]
+    assert HEADER.unpack_from(data) == (len(data), Kind.DATA)
     assert payload[0] == 7
     assert layout.unpack(payload) == [value for _, value in fields]
     assert layout.unpack(payload + b"\0") is None
-
-
-@given(st.lists(st.binary(max_size=40)), st.lists(st.integers(1, 20), min_size=1))
-def test_packets_come_whole_however_the_stream_is_cut(payloads, cuts):
-    stream = b"".join(packet(Kind.TEXT, payload) for payload in payloads)
-    reader, got, k = PacketReader(), [], 0
-    while stream:
-        piece, stream = stream[: cuts[k % len(cuts)]], stream[cuts[k % len(cuts)] :]
-        got += [payload for _, payload in reader.add(piece)]
-        k += 1
-    assert got == payloads
 
 
 class Rtde:
@@ -55,8 +44,6 @@ class Rtde:
 
     def __init__(self, host):
         self.socket = socket.create_connection((host, 30004), 5)
-        self.reader = PacketReader()
-        self.packets = []
 
     def send(self, kind, payload=b""):
         self.socket.sendall(packet(kind, payload))
@@ -64,14 +51,19 @@ class Rtde:
     def next(self, kind):
         """Payload of the next packet of a kind."""
         while True:
-            while self.packets:
-                found, payload = self.packets.pop(0)
-                if found == kind:
-                    return payload
-            data = self.socket.recv(4096)
-            if not data:
+            size, found = HEADER.unpack(self._read(HEADER.size))
+            payload = self._read(size - HEADER.size)
+            if found == kind:
+                return payload
+
+    def _read(self, size):
+        data = b""
+        while len(data) < size:
+            part = self.socket.recv(size - len(data))
+            if not part:
                 raise ConnectionError("closed")
-            self.packets += self.reader.add(data)
+            data += part
+        return data
 
     def ask(self, kind, payload=b""):
         self.send(kind, payload)

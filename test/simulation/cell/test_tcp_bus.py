@@ -20,7 +20,7 @@ from tactile_resonance.simulation.cell.tcp_bus import (
 from tactile_resonance.simulation.cell.transducer import CanFrame
 from tactile_resonance.simulation.plant.bench_time import STALL_S
 from tactile_resonance.simulation.ur5e import reactor as reactor_module
-from tactile_resonance.simulation.ur5e.reactor import MessageService, Reactor
+from tactile_resonance.simulation.ur5e.reactor import Reactor, Service, Until
 
 HOST = "127.0.6.3"
 FRAME = CanFrame(1.25, 0x001, bytes.fromhex("0B01F4FC18138803"))
@@ -206,13 +206,13 @@ def test_nobody_sends_before_the_bus_is_raw(served):
 def test_a_message_without_end_costs_its_sender_the_link_and_nobody_time(served, monkeypatch):
     """A client that sends faster than it is read must not keep the bus, and what steps it, to itself."""
     pieces = []
-    received = tcp_bus.BusClient.received
+    received = Service.received
 
     def noted(client, data):
         pieces.append(len(data))
         received(client, data)
 
-    monkeypatch.setattr(tcp_bus.BusClient, "received", noted)
+    monkeypatch.setattr(Service, "received", noted)
     with Talk(served) as good, Talk(served) as bad:
         listening(served, good)
         ended = threading.Event()
@@ -235,11 +235,8 @@ def test_a_message_without_end_costs_its_sender_the_link_and_nobody_time(served,
             ended.set()
             sender.join()
         assert max(pieces) <= reactor_module.MOST_AT_ONCE
-        assert (
-            MessageService.LONGEST
-            < sum(pieces)
-            <= MessageService.LONGEST + reactor_module.MOST_AT_ONCE
-        )
+        longest = Until(b">").longest
+        assert longest < sum(pieces) <= longest + reactor_module.MOST_AT_ONCE
         assert good.say(b"< nonsense >") == b"< error unknown command >"
 
 

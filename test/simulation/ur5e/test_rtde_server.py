@@ -4,22 +4,27 @@
 import struct
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tactile_resonance.simulation.ur5e.controller import UrController
-from tactile_resonance.simulation.ur5e.rtde_server import Kind, PacketReader, RtdeServer, packet
+from tactile_resonance.simulation.ur5e.reactor import Service
+from tactile_resonance.simulation.ur5e.rtde_server import HEADER, Kind, RtdeServer, packet
 
 
 class Connection:
     """Keeps what the server sends."""
 
     peer_port = 40_000
+    is_open = True
 
     def __init__(self):
-        self._reader = PacketReader()
         self.packets = []
 
     def send(self, data, droppable=False):
-        self.packets += [(Kind(kind), payload) for kind, payload in self._reader.add(data)]
+        size, kind = HEADER.unpack_from(data)
+        assert size == len(data)
+        self.packets.append((Kind(kind), data[HEADER.size :]))
         return True
 
     @property
@@ -38,9 +43,9 @@ def server():
 
 def client(server, names=b"timestamp"):
     connection = Connection()
-    service = server.serve(connection)
-    service.received(packet(Kind.OUTPUTS, struct.pack(">d", 500.0) + names))
-    service.received(packet(Kind.START, b""))
+    connection.service = Service(connection, server.serve(connection))
+    connection.service.received(packet(Kind.OUTPUTS, struct.pack(">d", 500.0) + names))
+    connection.service.received(packet(Kind.START, b""))
     return connection
 
 
@@ -64,6 +69,23 @@ def test_what_was_sent_is_sent_again(server):
 
 def test_nothing_is_sent_to_a_client_that_has_not_started(server):
     connection = Connection()
-    server.serve(connection).received(packet(Kind.OUTPUTS, struct.pack(">d", 500.0) + b"timestamp"))
+    service = Service(connection, server.serve(connection))
+    service.received(packet(Kind.OUTPUTS, struct.pack(">d", 500.0) + b"timestamp"))
     server.repeat()
     assert connection.stamps_s == []
+
+
+@given(
+    st.lists(st.just(b"\0\2") | st.binary(max_size=40)),
+    st.lists(st.integers(1, 20), min_size=1),
+)
+def test_packets_come_whole_however_the_stream_is_cut(payloads, cuts):
+    connection, k = Connection(), 0
+    service = Service(connection, RtdeServer(UrController()).serve(connection))
+    stream = b"".join(packet(Kind.PROTOCOL_VERSION, payload) for payload in payloads)
+    while stream:
+        piece, stream = stream[: cuts[k % len(cuts)]], stream[cuts[k % len(cuts)] :]
+        service.received(piece)
+        k += 1
+    answers = [bytes([payload == b"\0\2"]) for payload in payloads]
+    assert connection.packets == [(Kind.PROTOCOL_VERSION, answer) for answer in answers]
