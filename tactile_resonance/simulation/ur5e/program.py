@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program that serves an RTDE client.
+"""How the program that serves an RTDE client waits for commands and does them.
 
 The client uploads a URScript program that waits for command numbers in an input register. The
 simulated controller does not interpret URScript; it runs this loop, which keeps the same protocol:
@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.simulation.ur5e.commands import commands
-from tactile_resonance.simulation.ur5e.machine import Machine
 from tactile_resonance.simulation.ur5e.poses import Transform, transform_from_pose
 from tactile_resonance.simulation.ur5e.target import ScriptError, Thread
 from tactile_resonance.simulation.ur5e.variables import (
@@ -31,9 +29,6 @@ STREAMING = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58})
 
 READY, DONE = 1, 2
 STOP_SCRIPT = 255
-
-# Force mode as the client's program sets it when it starts.
-_GAIN_SCALING, _DAMPING = 0.5, 0.025
 
 # An asynchronous motion's progress word: counters of 7 bits, then a flag, then 15 bits of progress.
 _COUNTER_SPAN = 128
@@ -59,13 +54,15 @@ def register_offset(text: str) -> int:
     return int(found[1])
 
 
-class Program:
+Command = Callable[[], Thread | None]
+"""What a command does; a generator where that takes time."""
+
+
+class CommandLoop:
     """A running control program: its registers, its threads and its loop.
 
     Parameters
     ----------
-    machine : Machine
-        The arm that it moves.
     registers : Registers
     offset : int
         As `register_offset` returns it.
@@ -74,6 +71,8 @@ class Program:
     ----------
     offset : int
         Added to all register numbers: 0 or 24.
+    commands : dict of int to Command
+        What it does, by the number of the command; whoever has them sets it.
     threads : dict of str to generator
         Running threads by name.
     watchdog_s : float or None
@@ -82,17 +81,15 @@ class Program:
         Set by a thread for the main loop, where no command of the client waits.
     """
 
-    def __init__(self, machine: Machine, registers: Registers, offset: int) -> None:
-        machine.force_mode.gain_scaling = _GAIN_SCALING
-        machine.force_mode.damping = _DAMPING
+    def __init__(self, registers: Registers, offset: int) -> None:
         self.offset = offset
+        self.commands: dict[int, Command] = {}
         self.threads: dict[str, Thread] = {}
         self.watchdog_s: float | None = None
         self.internal_command = 0
         self._registers = registers
         self._progress_writes = 0
         self._operation = 0
-        self._commands = commands(self, machine)
         self._main = self._loop()
 
     def step(self) -> bool:
@@ -145,9 +142,9 @@ class Program:
 
     def _execute(self, command: int) -> Thread:
         """Do a command; raises ScriptError where the model has none such, or refuses its arguments."""
-        if command not in self._commands:
+        if command not in self.commands:
             raise ScriptError(f"command {command}: not modelled")
-        work = self._commands[command]()
+        work = self.commands[command]()
         if work is not None:
             yield from work
 
@@ -176,7 +173,7 @@ class Program:
         """Return the transform of a pose in six double input registers; raises as `doubles`."""
         return transform_from_pose(self.doubles(number))
 
-    def doubles(self, number: int, count: int = 6) -> tuple[float, ...]:
+    def doubles(self, number: int = 0, count: int = 6) -> tuple[float, ...]:
         """Return double input registers.
 
         Raises

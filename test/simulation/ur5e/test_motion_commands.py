@@ -154,3 +154,14 @@ def test_jogging_in_the_tools_frame(client):
     np.testing.assert_allclose(client.output("target_TCP_speed")[:3], 0.02 * axis, atol=1e-9)
     client.call(42)
     assert not client.output("target_qd").any()
+
+
+def test_jogging_again_takes_the_acceleration_that_comes_with_it(client):
+    client.call(41, [0, 0, 0.02, 0, 0, 0, 0, 0.02])
+    client.run(0.1)
+    slow = client.output("actual_TCP_speed")[2]
+    assert 0 < slow < 0.003
+    client.call(41, [0, 0, 0.02, 0, 0, 0, 0, 1.0])
+    client.run(0.1)
+    assert client.output("actual_TCP_speed")[2] == pytest.approx(0.02, rel=1e-3)
+    client.call(42)
