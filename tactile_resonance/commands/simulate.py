@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tactile_resonance.commands.options import add_option
 from tactile_resonance.contact.vectors import six
@@ -137,23 +137,19 @@ def _tabletop(options: argparse.Namespace) -> Tabletop:
     from tactile_resonance.contact.samples import Pose
     from tactile_resonance.sensor import read_sensor
     from tactile_resonance.simulation.plant.surfaces import LaidScene
-    from tactile_resonance.simulation.plant.tabletop import BenchSetup, Tabletop
+    from tactile_resonance.simulation.plant.tabletop import Tabletop, bench_surface
     from tactile_resonance.simulation.tissue.library import read_tissues
     from tactile_resonance.simulation.tissue.scene import read_scene
 
-    library = read_tissues()
-    laid = None
+    library, sensor = read_tissues(), read_sensor()
+    how: dict[str, Any] = {"rigid_tip": options.rigid_tip, "mount": Mount(options.mount)}
     if options.scene is not None:
         table = Pose.from_vector(np.array(options.table))
         laid = LaidScene(read_scene(library, options.scene), table)
-    setup = BenchSetup(
-        tissue=options.tissue or BenchSetup.tissue,
-        surface_height_m=options.surface_height,
-        tilt_rad=math.radians(options.tilt),
-        rigid_tip=options.rigid_tip,
-        mount=Mount(options.mount),
-    )
-    return Tabletop(setup, library, read_sensor(), laid)
+        return Tabletop.of_scene(library, sensor, laid, **how)
+    tissue = library[options.tissue]
+    surface = bench_surface(options.surface_height, math.radians(options.tilt))
+    return Tabletop(library, sensor, surface, lambda _: tissue, **how)
 
 
 def _attach(robot: SimulatedRobot, tabletop: Tabletop, options: argparse.Namespace) -> None:

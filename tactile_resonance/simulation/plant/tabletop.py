@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable
 from itertools import takewhile
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -121,41 +121,30 @@ TIP_IN_FLANGE = Pose(np.array([0.0, 0.0, 0.12]), np.array([0.0, math.pi, 0.0]))
 """Where the tip sits: 0.12 m before the flange, its z against the flange's."""
 
 
-@dataclass(frozen=True)
-class BenchSetup:
-    """What lies on the table and how the cell is mounted.
-
-    Attributes
-    ----------
-    tissue : str
-        Name in the library.
-    surface_height_m, tilt_rad, azimuth_rad : float
-        Of the undisturbed surface in the robot's base; see `FlatSurface.tilted`.
-    rigid_tip : bool
-        The ball on the robot itself; else at the end of the sensor's beam.
-    mount : Mount
-    """
-
-    tissue: str = "gel12"
-    surface_height_m: float = 0.2
-    tilt_rad: float = 0.0
-    azimuth_rad: float = 0.0
-    rigid_tip: bool = False
-    mount: Mount = Mount.TABLE
-
-    def __post_init__(self) -> None:
-        height = self.surface_height_m
-        require(-1 <= height <= 1, "surface_height_m", height, "-1 to 1")
-        require(abs(self.tilt_rad) <= 0.35, "tilt_rad", self.tilt_rad, "-0.35 to 0.35 (20 degrees)")
-        require(math.isfinite(self.azimuth_rad), "azimuth_rad", self.azimuth_rad, "a number")
-
-    def surface(self) -> FlatSurface:
-        """The undisturbed surface."""
-        return FlatSurface.tilted(self.surface_height_m, self.tilt_rad, self.azimuth_rad)
+def bench_surface(height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> FlatSurface:
+    """Return `FlatSurface.tilted` in the robot's base; ValueError where a bench has no such surface."""
+    require(-1 <= height_m <= 1, "surface_height_m", height_m, "-1 to 1")
+    require(abs(tilt_rad) <= 0.35, "tilt_rad", tilt_rad, "-0.35 to 0.35 (20 degrees)")
+    require(math.isfinite(azimuth_rad), "azimuth_rad", azimuth_rad, "a number")
+    return FlatSurface.tilted(height_m, tilt_rad, azimuth_rad)
 
 
 class Tabletop:
     """The plant with what can be exchanged on it while it runs.
+
+    Parameters
+    ----------
+    library : TissueLibrary
+    sensor : SensorParameters
+    surface : FlatSurface
+        The undisturbed surface in the robot's base.
+    tissue_at : callable
+        As a `Plant` asks for it.
+    motion : SurfaceMotion or None
+    rigid_tip : bool
+        The ball on the robot itself; else at the end of the sensor's beam.
+    mount : Mount
+        Of the cell.
 
     Attributes
     ----------
@@ -165,38 +154,46 @@ class Tabletop:
 
     def __init__(
         self,
-        setup: BenchSetup,
         library: TissueLibrary,
         sensor: SensorParameters,
-        laid: LaidScene | None = None,
+        surface: FlatSurface,
+        tissue_at: Callable[[FloatArray], Tissue | None],
+        motion: SurfaceMotion | None = None,
+        *,
+        rigid_tip: bool = False,
+        mount: Mount = Mount.TABLE,
     ) -> None:
         self._library = library
-        self._tissue: Tissue | None = library[setup.tissue]
-        self._scene = laid
-        if laid is None:
-            surface = setup.surface()
-        else:
-            surface = laid.surface()
-            # what is computed once must not hold up the first touch
-            laid.tissue_at(laid.table.position_m)
-        beam = None if setup.rigid_tip else sensor_modes(sensor)
-        tip = Tip(sensor.tip.radius_m, beam, library.contact.poisson_ratio)
+        tip = Tip(
+            sensor.tip.radius_m,
+            None if rigid_tip else sensor_modes(sensor),
+            library.contact.poisson_ratio,
+        )
         self.plant = Plant(
             surface,
-            self._tissue_at,
+            tissue_at,
             lambda tissue: tip.on(tissue, surface),
             tip_radius_m=tip.radius_m,
-            mounting=CellMounting(setup.mount),
+            mounting=CellMounting(mount),
         )
-        self.plant.motion = laid.scene.motion if laid else None
+        self.plant.motion = motion
+
+    @classmethod
+    def of_scene(
+        cls, library: TissueLibrary, sensor: SensorParameters, laid: LaidScene, **options: Any
+    ) -> Tabletop:
+        """Return the table with a scene on it; `options` are `rigid_tip` and `mount`."""
+        # what is computed once must not hold up the first touch
+        laid.tissue_at(laid.table.position_m)
+        return cls(library, sensor, laid.surface(), laid.tissue_at, laid.scene.motion, **options)
 
     def place_surface(self, fields: dict) -> dict:
         """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
-        self.plant.surface = BenchSetup(
-            surface_height_m=number(fields.get("height_m"), "height_m"),
-            tilt_rad=number(fields.get("tilt_rad", 0.0), "tilt_rad"),
-            azimuth_rad=number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
-        ).surface()
+        self.plant.surface = bench_surface(
+            number(fields.get("height_m"), "height_m"),
+            number(fields.get("tilt_rad", 0.0), "tilt_rad"),
+            number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
+        )
         return {}
 
     def move_surface(self, fields: dict) -> dict:
@@ -208,12 +205,9 @@ class Tabletop:
     def place_tissue(self, fields: dict) -> dict:
         """Control port: what the tip finds at its next new place; field ``name``, null for nothing."""
         name = fields.get("name")
-        self._tissue = None if name is None else self._library[str(name)]
-        self._scene = None
+        tissue = None if name is None else self._library[str(name)]
+        self.plant.tissue_at = lambda _: tissue
         return {}
-
-    def _tissue_at(self, position_m: FloatArray) -> Tissue | None:
-        return self._tissue if self._scene is None else self._scene.tissue_at(position_m)
 
     def truth(self, _: dict) -> dict:
         """Control port: the true state of the contact."""
