@@ -40,12 +40,12 @@ _LOCAL = "Command is not allowed: the robot is not in remote control"
 
 def serve_dashboard(controller: UrController, connection: Connection) -> Serving:
     """Serve one dashboard connection: each line is answered by one."""
-    c, safety = controller, controller.safety
+    c = controller
     # asked at any time
     questions: dict[str, Callable[[], str]] = {
-        "robotmode": lambda: f"Robotmode: {safety.robot_mode.name}",
-        "safetymode": lambda: f"Safetymode: {safety.safety_mode.name}",
-        "safetystatus": lambda: f"Safetystatus: {safety.safety_mode.name}",
+        "robotmode": lambda: f"Robotmode: {c.robot_mode.name}",
+        "safetymode": lambda: f"Safetymode: {c.safety_mode.name}",
+        "safetystatus": lambda: f"Safetystatus: {c.safety_mode.name}",
         "programState": lambda: f"{'PLAYING' if c.program else 'STOPPED'} rtde_control",
         "running": lambda: f"Program running: {str(c.program is not None).lower()}",
         "is in remote control": lambda: str(c.remote_control).lower(),
@@ -58,10 +58,10 @@ def serve_dashboard(controller: UrController, connection: Connection) -> Serving
         "quit": lambda: "Disconnected",
     }
     actions: dict[str, tuple[Callable[[], None], str]] = {
-        "power on": (safety.power_on, "Powering on"),
+        "power on": (c.power_on, "Powering on"),
         "power off": (c.power_off, "Powering off"),
-        "brake release": (safety.brake_release, "Brake releasing"),
-        "unlock protective stop": (safety.unlock_protective_stop, "Protective stop releasing"),
+        "brake release": (c.brake_release, "Brake releasing"),
+        "unlock protective stop": (c.unlock_protective_stop, "Protective stop releasing"),
         "restart safety": (lambda: None, "Restarting safety"),
         "close popup": (c.close_popup, "closing popup"),
         "close safety popup": (c.close_popup, "closing safety popup"),
@@ -258,7 +258,7 @@ class SimulatedRobot:
             "drop": lambda _: {"dropped": rtde.drop()},
             "protective_stop": partial(_plain, controller.protective_stop),
             "emergency_stop": partial(_plain, controller.emergency_stop),
-            "release_emergency_stop": partial(_plain, controller.safety.release_emergency_stop),
+            "release_emergency_stop": partial(_plain, controller.release_emergency_stop),
             "remote_control": partial(_switch, controller, "remote_control"),
             "script_starts": partial(_switch, controller, "script_starts"),
             "registers_in_use": partial(_switch, rtde, "registers_in_use"),
@@ -269,8 +269,8 @@ class SimulatedRobot:
         controller = self.controller
         return {
             "time_s": controller.time_s,
-            "robot_mode": controller.safety.robot_mode.name,
-            "safety_mode": controller.safety.safety_mode.name,
+            "robot_mode": controller.robot_mode.name,
+            "safety_mode": controller.safety_mode.name,
             "runtime_state": controller.runtime_state.name,
             "tcp_pose": controller.outputs("actual_TCP_pose"),
             "tcp_speed": controller.outputs("actual_TCP_speed"),

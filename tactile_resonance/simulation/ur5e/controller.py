@@ -78,105 +78,6 @@ class RefusedError(Exception):
     """The controller refuses what was asked of it, as its dashboard would answer."""
 
 
-class Safety:
-    """Modes of the robot.
-
-    Attributes
-    ----------
-    robot_mode : RobotMode
-    safety_mode : SafetyMode
-    """
-
-    def __init__(self) -> None:
-        self.robot_mode: RobotMode = RobotMode.RUNNING
-        self.safety_mode: SafetyMode = SafetyMode.NORMAL
-        self._time_s = 0.0
-        self._next_mode: RobotMode | None = None
-        self._due_s = 0.0
-        self._stopped_s = 0.0
-
-    @property
-    def may_move(self) -> bool:
-        """Brakes released, no stop in force."""
-        return self.robot_mode is RobotMode.RUNNING and self.safety_mode is SafetyMode.NORMAL
-
-    @property
-    def powered(self) -> bool:
-        """Whether motors, not brakes, hold the joints."""
-        return self.robot_mode is RobotMode.RUNNING
-
-    @property
-    def status_bits(self) -> int:
-        """RTDE output ``safety_status_bits``."""
-        return _STATUS_BITS[self.safety_mode]
-
-    def step(self, time_s: float, at_rest: bool) -> None:
-        """Advance to a time; at rest, a stop that removes power does so."""
-        self._time_s = time_s
-        if self._next_mode is not None and time_s >= self._due_s:
-            self.robot_mode, self._next_mode = self._next_mode, None
-        if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP and at_rest:
-            self.power_off()
-
-    def power_on(self) -> None:
-        """Power the arm; its brakes stay closed."""
-        self._require_normal("power on")
-        if self.robot_mode is RobotMode.POWER_OFF:
-            self.robot_mode = RobotMode.POWER_ON
-            self._switch(RobotMode.IDLE)
-
-    def brake_release(self) -> None:
-        """Release the brakes, powering the arm first where it is off."""
-        self._require_normal("release brakes")
-        if self.robot_mode is RobotMode.POWER_OFF:
-            self.robot_mode = RobotMode.POWER_ON
-        if self.robot_mode is not RobotMode.RUNNING:
-            self._switch(RobotMode.RUNNING)
-
-    def power_off(self) -> None:
-        """Close the brakes and remove power."""
-        self.robot_mode, self._next_mode = RobotMode.POWER_OFF, None
-
-    def protective_stop(self) -> None:
-        """Stop, power kept, until unlocked."""
-        if self.safety_mode is SafetyMode.NORMAL:
-            self.safety_mode = SafetyMode.PROTECTIVE_STOP
-            self._stopped_s = self._time_s
-
-    def unlock_protective_stop(self) -> None:
-        """End a protective stop.
-
-        Raises
-        ------
-        RefusedError
-            Within 5 s of the stop.
-        """
-        if self.safety_mode is not SafetyMode.PROTECTIVE_STOP:
-            return
-        if self._time_s - self._stopped_s < UNLOCK_DELAY_S:
-            raise RefusedError(
-                "Cannot unlock protective stop until 5s after occurrence. "
-                "Always inspect cause of protective stop before unlocking"
-            )
-        self.safety_mode = SafetyMode.NORMAL
-
-    def emergency_stop(self) -> None:
-        """Press the emergency stop: brake, then remove power."""
-        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
-
-    def release_emergency_stop(self) -> None:
-        """Release the button; the arm stays without power."""
-        if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
-            self.safety_mode = SafetyMode.NORMAL
-
-    def _require_normal(self, action: str) -> None:
-        if self.safety_mode is not SafetyMode.NORMAL:
-            raise RefusedError(f"cannot {action} in safety mode {self.safety_mode.name}")
-
-    def _switch(self, mode: RobotMode) -> None:
-        self._next_mode, self._due_s = mode, self._time_s + SWITCHING_S
-
-
 class RuntimeState(IntEnum):
     """RTDE output ``runtime_state``."""
 
@@ -194,8 +95,8 @@ class UrController:
     ----------
     machine : Machine
         The arm.
-    safety : Safety
-        Modes and stops.
+    robot_mode : RobotMode
+    safety_mode : SafetyMode
     registers : Registers
     program : Program or None
         The program that runs.
@@ -221,7 +122,8 @@ class UrController:
         self.machine: Machine = Machine(
             config or MachineConfig(), environment, np.random.default_rng(seed)
         )
-        self.safety: Safety = Safety()
+        self.robot_mode: RobotMode = RobotMode.RUNNING
+        self.safety_mode: SafetyMode = SafetyMode.NORMAL
         self.registers: Registers = Registers()
         self.program: Program | None = None
         self.runtime_state: RuntimeState = RuntimeState.STOPPED
@@ -232,6 +134,9 @@ class UrController:
         self.stood_still_s: float = 0.0
         self._cycles = 0
         self._refreshed_s = 0.0
+        self._next_mode: RobotMode | None = None
+        self._due_s = 0.0  # when that is reached
+        self._stopped_s = 0.0
 
     @property
     def time_s(self) -> float:
@@ -247,10 +152,25 @@ class UrController:
         self.machine.reseed(np.random.default_rng(seed))
 
     @property
+    def may_move(self) -> bool:
+        """Brakes released, no stop in force."""
+        return self.powered and self.safety_mode is SafetyMode.NORMAL
+
+    @property
+    def powered(self) -> bool:
+        """Whether motors, not brakes, hold the joints."""
+        return self.robot_mode is RobotMode.RUNNING
+
+    @property
     def status_bits(self) -> int:
         """RTDE output ``robot_status_bits``: power in bit 0, a running program in bit 1."""
-        powered = self.safety.robot_mode is not RobotMode.POWER_OFF
+        powered = self.robot_mode is not RobotMode.POWER_OFF
         return int(powered) | int(self.program is not None) << 1
+
+    @property
+    def safety_status_bits(self) -> int:
+        """RTDE output of this name."""
+        return _STATUS_BITS[self.safety_mode]
 
     @property
     def rests(self) -> bool:
@@ -296,9 +216,9 @@ class UrController:
         offset = register_offset(text)
         if not self.remote_control:
             raise RefusedError("not in remote control: the program is ignored")
-        if not self.safety.may_move:
+        if not self.may_move:
             raise RefusedError(
-                f"robot mode {self.safety.robot_mode.name}, safety mode {self.safety.safety_mode.name}: "
+                f"robot mode {self.robot_mode.name}, safety mode {self.safety_mode.name}: "
                 "the program is ignored"
             )
         if not self.script_starts:
@@ -313,21 +233,60 @@ class UrController:
         """End the program and brake."""
         self._end_program("stopped")
 
-    def protective_stop(self, reason: str = "injected") -> None:
-        """Stop, power kept, until unlocked; ends the program."""
-        self.safety.protective_stop()
-        self._end_program(f"protective stop: {reason}")
+    def power_on(self) -> None:
+        """Power the arm; its brakes stay closed. Raises RefusedError during a stop."""
+        self._require_normal("power on")
+        if self.robot_mode is RobotMode.POWER_OFF:
+            self.robot_mode = RobotMode.POWER_ON
+            self._switch(RobotMode.IDLE)
 
-    def emergency_stop(self) -> None:
-        """Press the emergency stop; ends the program."""
-        self.safety.emergency_stop()
-        self._end_program("emergency stop")
+    def brake_release(self) -> None:
+        """Release the brakes, powering the arm first where it is off. Raises RefusedError during a stop."""
+        self._require_normal("release brakes")
+        if self.robot_mode is RobotMode.POWER_OFF:
+            self.robot_mode = RobotMode.POWER_ON
+        if not self.powered:
+            self._switch(RobotMode.RUNNING)
 
     def power_off(self) -> None:
         """Close the brakes and remove power; ends the program."""
         self._end_program("power off")
-        self.safety.power_off()
+        self.robot_mode, self._next_mode = RobotMode.POWER_OFF, None
         self.machine.catch_with_brakes()
+
+    def protective_stop(self, reason: str = "injected") -> None:
+        """Stop, power kept, until unlocked; ends the program."""
+        if self.safety_mode is SafetyMode.NORMAL:
+            self.safety_mode = SafetyMode.PROTECTIVE_STOP
+            self._stopped_s = self.time_s
+        self._end_program(f"protective stop: {reason}")
+
+    def unlock_protective_stop(self) -> None:
+        """End a protective stop.
+
+        Raises
+        ------
+        RefusedError
+            Within 5 s of the stop.
+        """
+        if self.safety_mode is not SafetyMode.PROTECTIVE_STOP:
+            return
+        if self.time_s - self._stopped_s < UNLOCK_DELAY_S:
+            raise RefusedError(
+                "Cannot unlock protective stop until 5s after occurrence. "
+                "Always inspect cause of protective stop before unlocking"
+            )
+        self.safety_mode = SafetyMode.NORMAL
+
+    def emergency_stop(self) -> None:
+        """Press the emergency stop: brake, then remove power; ends the program."""
+        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
+        self._end_program("emergency stop")
+
+    def release_emergency_stop(self) -> None:
+        """Release the button; the arm stays without power."""
+        if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
+            self.safety_mode = SafetyMode.NORMAL
 
     def close_popup(self) -> None:
         """Close the popup on the pendant."""
@@ -342,15 +301,16 @@ class UrController:
         self._watch()
         if self.program is not None:
             self._run_program()
-        was_powered = self.safety.powered
-        self.machine.step(was_powered)
+        self.machine.step(self.powered)
         force = math.hypot(*self.machine.tcp_force[:3])
-        if force > self.machine.config.limits.tool_force_n and self.safety.may_move:
+        if force > self.machine.config.limits.tool_force_n and self.may_move:
             self.protective_stop(f"force of {force:.0f} N at the tool")
-        at_rest = not any(target.qd) and largest(self.machine.joints.qd) < _AT_REST_RAD_S
-        self.safety.step(self.time_s, at_rest)
-        if was_powered and not self.safety.powered:
-            self.machine.catch_with_brakes()
+        if self._next_mode is not None and self.time_s >= self._due_s:
+            self.robot_mode, self._next_mode = self._next_mode, None
+        if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
+            at_rest = not any(target.qd) and largest(self.machine.joints.qd) < _AT_REST_RAD_S
+            if at_rest and self.robot_mode is not RobotMode.POWER_OFF:
+                self.power_off()
         if self.runtime_state is RuntimeState.STOPPING and not any(target.qd):
             self.runtime_state = RuntimeState.STOPPED
 
@@ -384,6 +344,13 @@ class UrController:
             self.machine.force_mode.end()
             self.runtime_state = RuntimeState.STOPPING
             self._note(f"program: {reason}")
+
+    def _require_normal(self, action: str) -> None:
+        if self.safety_mode is not SafetyMode.NORMAL:
+            raise RefusedError(f"cannot {action} in safety mode {self.safety_mode.name}")
+
+    def _switch(self, mode: RobotMode) -> None:
+        self._next_mode, self._due_s = mode, self.time_s + SWITCHING_S
 
     def _note(self, line: str) -> None:
         self.log.append(f"{self.time_s:.3f} s {line}")

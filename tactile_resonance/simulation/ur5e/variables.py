@@ -130,7 +130,7 @@ def _tool_accelerometer(robot: UrController) -> Vector:
 
 def _joint_mode(robot: UrController) -> list[int]:
     """Mode of each joint."""
-    return [JOINT_RUNNING if robot.safety.powered else JOINT_POWER_OFF] * 6
+    return [JOINT_RUNNING if robot.powered else JOINT_POWER_OFF] * 6
 
 
 Reader = Callable[["UrController"], tuple[float, ...] | OutputValue]
@@ -161,9 +161,9 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "actual_digital_input_bits": ("UINT64", lambda robot: robot.registers.digital_inputs),
     "actual_digital_output_bits": ("UINT64", lambda robot: robot.registers.digital_outputs),
     "joint_temperatures": ("VECTOR6D", lambda robot: [NOMINAL_TEMPERATURE_C] * 6),
-    "robot_mode": ("INT32", lambda robot: int(robot.safety.robot_mode)),
+    "robot_mode": ("INT32", lambda robot: int(robot.robot_mode)),
     "joint_mode": ("VECTOR6INT32", _joint_mode),
-    "safety_mode": ("INT32", lambda robot: int(robot.safety.safety_mode)),
+    "safety_mode": ("INT32", lambda robot: int(robot.safety_mode)),
     "actual_tool_accelerometer": ("VECTOR3D", _tool_accelerometer),
     "speed_scaling": (
         "DOUBLE",
@@ -171,13 +171,13 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     ),
     "target_speed_fraction": ("DOUBLE", lambda robot: robot.registers.speed_slider),
     "actual_main_voltage": ("DOUBLE", lambda robot: MAINS_V),
-    "actual_robot_voltage": ("DOUBLE", lambda robot: ROBOT_BUS_V if robot.safety.powered else 0.0),
-    "actual_joint_voltage": ("VECTOR6D", lambda robot: [ROBOT_BUS_V * robot.safety.powered] * 6),
+    "actual_robot_voltage": ("DOUBLE", lambda robot: ROBOT_BUS_V if robot.powered else 0.0),
+    "actual_joint_voltage": ("VECTOR6D", lambda robot: [ROBOT_BUS_V * robot.powered] * 6),
     "runtime_state": ("UINT32", lambda robot: int(robot.runtime_state)),
     "standard_analog_output0": ("DOUBLE", lambda robot: robot.registers.analog_outputs[0]),
     "standard_analog_output1": ("DOUBLE", lambda robot: robot.registers.analog_outputs[1]),
     "robot_status_bits": ("UINT32", lambda robot: robot.status_bits),
-    "safety_status_bits": ("UINT32", lambda robot: robot.safety.status_bits),
+    "safety_status_bits": ("UINT32", lambda robot: robot.safety_status_bits),
     "ft_raw_wrench": ("VECTOR6D", lambda robot: robot.machine.sensor.raw),
     "payload": ("DOUBLE", lambda robot: robot.machine.payload.mass_kg),
     "payload_cog": ("VECTOR3D", lambda robot: robot.machine.payload.cog_m),

@@ -147,7 +147,7 @@ def test_past_joint_positions(client):
 def test_triggered_protective_stop_ends_the_program(client):
     client.write(31)
     client.run(0.1)
-    assert client.controller.safety.safety_mode is SafetyMode.PROTECTIVE_STOP
+    assert client.controller.safety_mode is SafetyMode.PROTECTIVE_STOP
     assert client.controller.outputs("safety_status_bits") >> 2 & 1
     assert client.controller.program is None
 

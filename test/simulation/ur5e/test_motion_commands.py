@@ -144,7 +144,7 @@ def test_moving_while_a_thread_moves_the_arm_ends_the_program(client):
     assert client.controller.program is None
     assert "another thread" in client.controller.log[-1]
     assert client.controller.outputs("runtime_state") == RuntimeState.STOPPED
-    assert client.controller.safety.safety_mode is SafetyMode.NORMAL
+    assert client.controller.safety_mode is SafetyMode.NORMAL
 
 
 def test_jogging_in_the_tools_frame(client):

@@ -44,8 +44,8 @@ def test_what_is_refused_is_told_on_the_pendant_and_in_the_log(client, place, od
 @pytest.mark.parametrize("odd", [np.nan, np.inf])
 def test_an_external_sensor_that_sends_no_number_stops_the_robot(client, odd):
     client.call(56, [0.0] * 7, [1])
-    assert client.controller.safety.safety_mode is SafetyMode.NORMAL
+    assert client.controller.safety_mode is SafetyMode.NORMAL
     client.controller.write_inputs({"external_force_torque": [0.0, 0.0, odd, 0.0, 0.0, 0.0]})
     client.run(0.01)
-    assert client.controller.safety.safety_mode is SafetyMode.PROTECTIVE_STOP
+    assert client.controller.safety_mode is SafetyMode.PROTECTIVE_STOP
     assert np.isfinite(client.output("target_q")).all()

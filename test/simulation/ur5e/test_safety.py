@@ -46,11 +46,11 @@ def test_protective_stop_brakes_keeps_power_and_unlocks_after_five_seconds(movin
     assert controller.outputs("robot_mode") == RobotMode.RUNNING
     assert controller.outputs("robot_status_bits") == 1  # powered, no program
     with pytest.raises(RefusedError, match="until 5s after occurrence"):
-        controller.safety.unlock_protective_stop()
+        controller.unlock_protective_stop()
     with pytest.raises(RefusedError, match="PROTECTIVE_STOP"):
         controller.start_program(PROGRAM)
     run(controller, 5.0)
-    controller.safety.unlock_protective_stop()
+    controller.unlock_protective_stop()
     assert controller.outputs("safety_status_bits") == 1
     controller.start_program(PROGRAM)
     controller.step()
@@ -62,26 +62,26 @@ def test_emergency_stop_removes_power_after_braking_and_recovers_in_order(moving
     controller.emergency_stop()
     controller.step()
     assert controller.outputs("safety_status_bits") >> 7 & 1
-    assert controller.safety.robot_mode is RobotMode.RUNNING  # still braking
+    assert controller.robot_mode is RobotMode.RUNNING  # still braking
     run(controller, 0.5)
-    assert controller.safety.robot_mode is RobotMode.POWER_OFF
+    assert controller.robot_mode is RobotMode.POWER_OFF
     assert controller.outputs("robot_status_bits") == 0
     np.testing.assert_allclose(moving.output("actual_q"), moving.output("target_q"), atol=1e-12)
     stopped = moving.output("actual_q")
     with pytest.raises(RefusedError, match="ROBOT_EMERGENCY_STOP"):
-        controller.safety.power_on()
-    controller.safety.release_emergency_stop()
-    assert controller.safety.safety_mode is SafetyMode.NORMAL
-    assert controller.safety.robot_mode is RobotMode.POWER_OFF
-    controller.safety.power_on()
-    assert controller.safety.robot_mode is RobotMode.POWER_ON
+        controller.power_on()
+    controller.release_emergency_stop()
+    assert controller.safety_mode is SafetyMode.NORMAL
+    assert controller.robot_mode is RobotMode.POWER_OFF
+    controller.power_on()
+    assert controller.robot_mode is RobotMode.POWER_ON
     run(controller, 0.3)
-    assert controller.safety.robot_mode is RobotMode.IDLE
+    assert controller.robot_mode is RobotMode.IDLE
     with pytest.raises(RefusedError, match="IDLE"):
         controller.start_program(PROGRAM)
-    controller.safety.brake_release()
+    controller.brake_release()
     run(controller, 0.3)
-    assert controller.safety.robot_mode is RobotMode.RUNNING
+    assert controller.robot_mode is RobotMode.RUNNING
     np.testing.assert_allclose(moving.output("actual_q"), stopped, atol=1e-12)
     controller.start_program(PROGRAM)
 
@@ -102,7 +102,7 @@ def test_a_singular_path_is_a_protective_stop_of_the_robot(make_client):
     for _ in range(2000):
         client.controller.step()
         fastest = max(fastest, np.abs(client.output("target_qd")).max())
-    assert client.controller.safety.safety_mode is SafetyMode.PROTECTIVE_STOP
+    assert client.controller.safety_mode is SafetyMode.PROTECTIVE_STOP
     assert fastest <= np.pi * (1 + 1e-6)
     client.run(0.5)
     assert not client.output("target_qd").any()
@@ -245,7 +245,7 @@ def test_limits_hold_whatever_a_client_sends(make_client, seed):
         if controller.program is None:
             client.run(5.2)
             assert not client.output("target_qd").any()
-            controller.safety.unlock_protective_stop()
+            controller.unlock_protective_stop()
             controller.start_program(PROGRAM)
             controller.step()
     assert travelled > 0.5

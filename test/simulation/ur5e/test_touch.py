@@ -156,7 +156,7 @@ def test_too_much_force_is_a_protective_stop(touching):
     pose = touching.output("target_TCP_pose")
     touching.write(3, [*(pose - [0, 0, 0.03, 0, 0, 0]), 0.05, 0.5])
     touching.run(1.5)
-    assert touching.controller.safety.safety_mode is SafetyMode.PROTECTIVE_STOP
+    assert touching.controller.safety_mode is SafetyMode.PROTECTIVE_STOP
     assert "N at the tool" in touching.controller.log[-1]
     assert touching.output("actual_TCP_force")[2] < 1.5 * 150.0
 
