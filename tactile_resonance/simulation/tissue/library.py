@@ -147,27 +147,31 @@ def uniform(tissue: Tissue) -> Material:
     return lambda position_m: tissue
 
 
-@dataclass(frozen=True)
-class RandomField:
-    """A Gaussian random field of unit variance, correlation ``exp(-r^2 / (2 l^2))``.
+@dataclass(frozen=True, kw_only=True)
+class HeterogeneityEntry:
+    """Part of a file: a Gaussian random field, and how far the modulus follows it.
 
-    A sum of plane waves with Gaussian wave vectors (spectral representation: Shinozuka & Deodatis,
-    Appl. Mech. Rev. 44 (1991)), so that its value at a place depends on the seed and the place
-    alone, in whatever order places are asked for.
+    Of unit variance, correlation ``exp(-r^2 / (2 l^2))``: a sum of plane waves with Gaussian wave vectors
+    (spectral representation: Shinozuka & Deodatis, Appl. Mech. Rev. 44 (1991)), so that its value at a place
+    depends on the seed and the place alone, in whatever order places are asked for.
 
     Attributes
     ----------
     correlation_length_m : float
         l: distance at which the correlation is 0.61.
     seed : int
+    modulus_spread : float
+        Standard deviation of ln E.
     """
 
     correlation_length_m: float
     seed: int = 0
+    modulus_spread: float
 
     def __post_init__(self) -> None:
         check_above_zero(self, "correlation_length_m")
         check_not_negative(self, "seed")
+        check_within(self, modulus_spread=(0, 1))
 
     @cached_property
     def _waves(self) -> tuple[FloatArray, FloatArray]:
@@ -181,6 +185,17 @@ class RandomField:
         vectors, phases = self._waves
         wave = np.cos(np.asarray(position_m, dtype=float) @ vectors + phases)  # (..., waves)
         return np.asarray(np.sqrt(2 / WAVES) * wave.sum(axis=-1))
+
+    def over(self, material: Material) -> Material:
+        """Return a material whose modulus varies at random: log-normal with mean 1, ratios unchanged."""
+
+        def tissue_at(position_m: FloatArray) -> Tissue:
+            tissue, spread = material(position_m), self.modulus_spread
+            exponent = spread * self.value(position_m) - spread**2 / 2
+            modulus = tissue.relaxation_modulus_1s_pa * float(np.exp(exponent))
+            return replace(tissue, relaxation_modulus_1s_pa=modulus, gelatine_percent=None)
+
+        return tissue_at
 
 
 def mixture(first: Tissue, second: Tissue, share: float, modulus_1s_pa: float) -> Tissue:
@@ -256,34 +271,6 @@ class GradientEntry:
             if low is None or high is None:
                 return geometric_mixture(first, second, share)
             return library.gelatine(low + share * (high - low))
-
-        return tissue_at
-
-
-@dataclass(frozen=True, kw_only=True)
-class HeterogeneityEntry(RandomField):
-    """Part of a file: a random field, and how far the modulus follows it.
-
-    Attributes
-    ----------
-    modulus_spread : float
-        Standard deviation of ln E.
-    """
-
-    modulus_spread: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_within(self, modulus_spread=(0, 1))
-
-    def over(self, material: Material) -> Material:
-        """Return a material whose modulus varies at random: log-normal with mean 1, ratios unchanged."""
-
-        def tissue_at(position_m: FloatArray) -> Tissue:
-            tissue, spread = material(position_m), self.modulus_spread
-            exponent = spread * self.value(position_m) - spread**2 / 2
-            modulus = tissue.relaxation_modulus_1s_pa * float(np.exp(exponent))
-            return replace(tissue, relaxation_modulus_1s_pa=modulus, gelatine_percent=None)
 
         return tissue_at
 

@@ -18,7 +18,6 @@ from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import (
     GradientEntry,
     HeterogeneityEntry,
-    RandomField,
     TissueEntry,
     geometric_mixture,
     mixture,
@@ -166,7 +165,9 @@ def test_mixtures_stay_passive_and_run_from_one_to_the_other(library):
 def test_random_field_has_the_stated_correlation():
     """Over 4000 seeds: mean 0, variance 1, exp(-1/2) at one correlation length, each at 5 sigma."""
     places = np.array([[0.0, 0.0, 0.0], [4e-3, 0.0, 0.0], [0.0, 0.0, 8e-3]])
-    values = np.array([RandomField(4e-3, seed).value(places) for seed in range(4000)])  # (s, 3)
+    known = {"correlation_length_m": 4e-3, "modulus_spread": 0.1}
+    fields = [HeterogeneityEntry(seed=seed, **known) for seed in range(4000)]
+    values = np.array([field.value(places) for field in fields])  # (s, 3)
     expected = np.exp([[0, -0.5, -2], [-0.5, 0, -2.5], [-2, -2.5, 0]])
     found = values.T @ values / 4000
     # of a product of standard Gaussians: variance 1 + correlation^2
@@ -178,8 +179,8 @@ def test_random_field_has_the_stated_correlation():
 
 def test_heterogeneity_repeats_and_keeps_the_mean_modulus(library):
     gel = library["gel10"]
-    material = HeterogeneityEntry(2e-3, 7, modulus_spread=0.1).over(uniform(gel))
-    again = HeterogeneityEntry(2e-3, 7, modulus_spread=0.1).over(uniform(gel))
+    material = HeterogeneityEntry(correlation_length_m=2e-3, seed=7, modulus_spread=0.1).over(uniform(gel))
+    again = HeterogeneityEntry(correlation_length_m=2e-3, seed=7, modulus_spread=0.1).over(uniform(gel))
     place = np.array([0.01, -0.02, 0.0])
     assert material(place) == again(place)
     x = np.linspace(0, 2.0, 2001)  # a thousand correlation lengths
