@@ -188,24 +188,29 @@ class _Client:
         self._started = False
         self._newest = b""  # outputs that were sent last
         self.sent_ns = 0
-        self._answers = {
-            Kind.PROTOCOL_VERSION: self._protocol_version,
-            Kind.CONTROLLER_VERSION: self._controller_version,
-            Kind.OUTPUTS: self._set_up_outputs,
-            Kind.INPUTS: self._set_up_inputs,
-            Kind.START: self._start,
-            Kind.PAUSE: self._pause,
-        }
 
     def take(self, kind: int, payload: bytes) -> None:
         """Answer a request, or take inputs."""
         if kind == Kind.DATA:
             self._take_inputs(payload)
-        elif kind in self._answers:
-            kind = Kind(kind)
-            self.connection.send(packet(kind, self._answers[kind](payload)))
-        elif kind != Kind.TEXT:
+            return
+        if kind == Kind.TEXT:
+            return
+        if kind == Kind.PROTOCOL_VERSION:
+            answer = bytes([payload == struct.pack(">H", PROTOCOL_VERSION)])
+        elif kind == Kind.CONTROLLER_VERSION:
+            answer = struct.pack(">4I", *POLYSCOPE)
+        elif kind == Kind.OUTPUTS:
+            answer = self._set_up_outputs(payload)
+        elif kind == Kind.INPUTS:
+            answer = self._set_up_inputs(payload)
+        elif kind in (Kind.START, Kind.PAUSE):
+            self._started = kind == Kind.START and self._outputs is not None
+            self.connection.patient = self._started
+            answer = bytes([self._started or kind == Kind.PAUSE])
+        else:
             raise ValueError(f"RTDE packet: type {kind}, expected one of 'VvMUOISP'")
+        self.connection.send(packet(Kind(kind), answer))
 
     def publish(self, cycle: int, known: dict[tuple[str, ...], bytes]) -> None:
         """Send the outputs where they are due; a client that does not read misses them.
@@ -230,12 +235,6 @@ class _Client:
             self.connection.send(self._newest, droppable=True)
         else:
             self.publish(0, {})
-
-    def _protocol_version(self, payload: bytes) -> bytes:
-        return bytes([payload == struct.pack(">H", PROTOCOL_VERSION)])
-
-    def _controller_version(self, _: bytes) -> bytes:
-        return struct.pack(">4I", *POLYSCOPE)
 
     def _set_up_outputs(self, payload: bytes) -> bytes:
         if len(payload) < 8:
@@ -264,14 +263,6 @@ class _Client:
         self._recipes[recipe] = _Recipe(names, Layout(types))
         self.inputs.update(names)
         return bytes([recipe]) + ",".join(types).encode()
-
-    def _start(self, _: bytes) -> bytes:
-        self._started = self.connection.patient = self._outputs is not None
-        return bytes([self._started])
-
-    def _pause(self, _: bytes) -> bytes:
-        self._started = self.connection.patient = False
-        return b"\x01"
 
     def _take_inputs(self, payload: bytes) -> None:
         recipe = self._recipes.get(payload[0]) if payload else None
