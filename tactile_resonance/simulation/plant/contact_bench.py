@@ -28,7 +28,7 @@ from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import six, vector
 from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
 from tactile_resonance.simulation.noise import Jitter
-from tactile_resonance.simulation.plant.plant import CellMounting, Plant
+from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -387,20 +387,19 @@ class ContactBench:
     ) -> None:
         tip = Tip() if tip is None else tip
         on_tool = mount is Mount.TOOL
-        centre = np.array([-0.03, 0.0, 0.01] if on_tool else [0.0, 0.0, -0.01])
-        mounting = CellMounting(mount, carried_kg=tool_kg if on_tool else DISH_KG, centre_m=centre)
+        tool, dish = Payload(tool_kg, (-0.03, 0.0, 0.01)), Payload(DISH_KG, (0.0, 0.0, -0.01))
         self.plant = Plant(
             surface,
             lambda _: tissue,
             lambda found: tip.on(found, surface),
             tip_radius_m=tip.radius_m,
-            mounting=mounting,
+            mount=mount,
+            carried=tool if on_tool else dish,
         )
         motion = TipMotion(tracking or TrackingParameters(), start, period_s=period_s, seed=seed)
         self.clock = VirtualBench(self.plant, motion)
         self.arm = VirtualArm(self.clock)
-        payload = Payload(tool_kg, vector(centre)) if on_tool else None
-        seat = Mounting(mount, Pose.at_origin(), payload)
+        seat = Mounting(mount, Pose.at_origin(), tool if on_tool else None)
         self.cell = VirtualCell(self.clock, seat, cell_parameters, seed=seed)
         self.arm.connect()
         self.cell.start()

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.contact.payload import GRAVITY_M_S2
+from tactile_resonance.contact.payload import GRAVITY_M_S2, Payload
 from tactile_resonance.contact.vectors import (
     Vector,
     added,
@@ -43,33 +42,13 @@ STANDING_M = 1e-5
 """A tip that moves less than this along the surface in a step is above the place that it will touch."""
 
 
-@dataclass(frozen=True)
-class CellMounting:
-    """Where the load cell sits, its frame that of the tip or the base, and what else it carries.
-
-    Attributes
-    ----------
-    mount : Mount
-    carried_kg : float
-        Mass that the cell carries: tool beyond it, or the sample with its dish.
-    centre_m : (3,) array
-        Centre of that mass: in the frame `tip` on the tool, in the base under the sample.
-    """
-
-    mount: Mount = Mount.TABLE
-    carried_kg: float = 0.0
-    centre_m: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    def __post_init__(self) -> None:
-        good = 0 <= self.carried_kg < math.inf
-        require(good, "carried_kg", self.carried_kg, "a mass, 0 or above")
-
-
 POISSON_RATIO = 0.49
 """Of what is touched, where the contact slips; see `SLIP`."""
 
 SLIP = 2 * (1 - POISSON_RATIO) / (2 - POISSON_RATIO)
 """Tangential over normal stiffness of the contact before it slips (Mindlin 1949)."""
+
+NOTHING = Payload(0.0, ORIGIN)
 
 
 class Plant:
@@ -85,7 +64,10 @@ class Plant:
     tip : callable
         From a tissue to a `TipOnTissue` at rest on it; its ball is that of `relative_radius_m`.
     tip_radius_m : float
-    mounting : CellMounting
+    mount : Mount
+        Of the cell, whose frame is that of the tip or the base.
+    carried : Payload
+        What else the cell carries: the tool beyond it, or the sample with its dish.
     friction : float
         Coefficient of Coulomb friction; 0.1 is chosen for a wet plastic ball, not measured.
 
@@ -123,7 +105,8 @@ class Plant:
         tip: Callable[[Tissue], TipOnTissue],
         *,
         tip_radius_m: float,
-        mounting: CellMounting | None = None,
+        mount: Mount = Mount.TABLE,
+        carried: Payload = NOTHING,
         friction: float = 0.1,
     ) -> None:
         require(0 < tip_radius_m < math.inf, "tip_radius_m", tip_radius_m, "a number above 0")
@@ -131,7 +114,7 @@ class Plant:
         self.motion: SurfaceMotion | None = None
         self.tissue_at = tissue_at
         self.tip_radius_m = tip_radius_m
-        self.mounting = CellMounting() if mounting is None else mounting
+        self.mount, self.carried = mount, carried
         self.friction = friction
         self.time_s = 0.0
         self.force_n = self.torque_nm = ORIGIN
@@ -150,7 +133,6 @@ class Plant:
         self._held_n = ORIGIN  # force on what holds the tip: the beam's, where there is one
         self._turn = IDENTITY[0]  # of the tip
         self._stepped = False
-        self._carried_m = vector(self.mounting.centre_m)
         self._gravity_m_s2 = vector(GRAVITY_M_S2)
         self._places: list[Vector] = []  # of the carried mass, newest last
         self._unloaded: tuple[Vector, Vector] | None = None  # what a cell that stands feels then
@@ -194,9 +176,9 @@ class Plant:
             # the ball is touched at its lowest point
             radius = -self.tip_radius_m
             self.torque_nm = cross((radius * nx, radius * ny, radius * nz), (x, y, z))
-        if self.mounting.mount is Mount.TOOL:
-            carried = added(place, rotated(self._turn, self._carried_m))
-            self._places = [*self._places[-2:], carried]
+        if self.mount is Mount.TOOL:
+            carried_m = added(place, rotated(self._turn, self.carried.centre_m))
+            self._places = [*self._places[-2:], carried_m]
 
     def wrench_at_cell(self) -> tuple[Vector, Vector]:
         """Force [N] and torque [N m] on the cell about its origin, in its frame, without noise.
@@ -206,14 +188,14 @@ class Plant:
         """
         if not self._stepped:
             raise RuntimeError("wrench_at_cell: the plant has not been stepped yet")
-        untouched = self.force_n is ORIGIN and self.mounting.mount is Mount.TABLE
+        untouched = self.force_n is ORIGIN and self.mount is Mount.TABLE
         if untouched and self._unloaded is not None:
             return self._unloaded
-        mass = self.mounting.carried_kg
+        mass = self.carried.mass_kg
         gx, gy, gz = self._gravity_m_s2
         cx, cy, cz = self.torque_nm
-        if self.mounting.mount is Mount.TABLE:
-            turn, origin, centre = IDENTITY[0], ORIGIN, self._carried_m
+        if self.mount is Mount.TABLE:
+            turn, origin, centre = IDENTITY[0], ORIGIN, self.carried.centre_m
             fx, fy, fz = self.force_n
             fx, fy, fz, cx, cy, cz = -fx, -fy, -fz, -cx, -cy, -cz
         else:

@@ -103,9 +103,9 @@ def serve_dashboard(controller: UrController, connection: Connection) -> Serving
         connection.send((answer(request) + "\n").encode())
 
 
-Orders = dict[str, Callable[[dict], dict]]
+Orders = dict[str, Callable[[dict], dict | None]]
 """Name of each command and the function that does it: takes the fields of the request, returns those of the
-answer, raises ValueError where it refuses."""
+answer where there are any, raises ValueError where it refuses."""
 
 
 def serve_orders(orders: Orders, connection: Connection) -> Serving:
@@ -117,7 +117,7 @@ def serve_orders(orders: Orders, connection: Connection) -> Serving:
             name = fields.get("command") if isinstance(fields, dict) else None
             if not isinstance(name, str) or name not in orders:
                 raise ValueError(f"command: expected one of {', '.join(orders)}")
-            answer = {"ok": True, **orders[name](fields)}
+            answer = {"ok": True, **(orders[name](fields) or {})}
         except RecursionError:
             answer = {"ok": False, "error": "request: nested too deeply"}
         except ValueError as error:
@@ -256,9 +256,9 @@ class SimulatedRobot:
             "state": self._state,
             "freeze": self._freeze,
             "drop": lambda _: {"dropped": rtde.drop()},
-            "protective_stop": partial(_plain, controller.protective_stop),
-            "emergency_stop": partial(_plain, controller.emergency_stop),
-            "release_emergency_stop": partial(_plain, controller.release_emergency_stop),
+            "protective_stop": lambda _: controller.protective_stop(),
+            "emergency_stop": lambda _: controller.emergency_stop(),
+            "release_emergency_stop": lambda _: controller.release_emergency_stop(),
             "remote_control": partial(_switch, controller, "remote_control"),
             "script_starts": partial(_switch, controller, "script_starts"),
             "registers_in_use": partial(_switch, rtde, "registers_in_use"),
@@ -281,7 +281,7 @@ class SimulatedRobot:
             "longest_delay_s": self.time.longest_delay_s,
         }
 
-    def _freeze(self, fields: dict) -> dict:
+    def _freeze(self, fields: dict) -> None:
         seconds = number(fields.get("seconds"), "seconds")
         if not 0 < seconds <= _LONGEST_FREEZE_S:
             raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
@@ -294,19 +294,11 @@ class SimulatedRobot:
             self._halted_until_ns = until_ns
         else:
             raise ValueError(f"part: {part!r}, expected 'network' or 'controller'")
-        return {}
 
 
-def _plain(action: Callable[[], None], _: dict) -> dict:
-    """An order without fields and without an answer."""
-    action()
-    return {}
-
-
-def _switch(target: Any, name: str, fields: dict) -> dict:
+def _switch(target: Any, name: str, fields: dict) -> None:
     """An order that sets an attribute to its field ``value``."""
     value = fields.get("value")
     if not isinstance(value, bool):
         raise ValueError(f"value: {value!r}, expected true or false")
     setattr(target, name, value)
-    return {}

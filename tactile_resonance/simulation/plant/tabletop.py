@@ -25,7 +25,7 @@ from tactile_resonance.fields import number, read_dataclass, require
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.cell.tcp_bus import TcpBus
 from tactile_resonance.simulation.cell.transducer import LoadCell
-from tactile_resonance.simulation.plant.plant import CellMounting, Plant
+from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, LaidScene, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Tip
@@ -174,7 +174,7 @@ class Tabletop:
             tissue_at,
             lambda tissue: tip.on(tissue, surface),
             tip_radius_m=tip.radius_m,
-            mounting=CellMounting(mount),
+            mount=mount,
         )
         self.plant.motion = motion
 
@@ -187,27 +187,24 @@ class Tabletop:
         laid.tissue_at(laid.table.position_m)
         return cls(library, sensor, laid.surface(), laid.tissue_at, laid.scene.motion, **options)
 
-    def place_surface(self, fields: dict) -> dict:
+    def place_surface(self, fields: dict) -> None:
         """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
         self.plant.surface = bench_surface(
             number(fields.get("height_m"), "height_m"),
             number(fields.get("tilt_rad", 0.0), "tilt_rad"),
             number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
         )
-        return {}
 
-    def move_surface(self, fields: dict) -> dict:
+    def move_surface(self, fields: dict) -> None:
         """Control port: how the surface moves from now on; fields of `SurfaceMotion`, none: at rest."""
         asked = {name: value for name, value in fields.items() if name != "command"}
         self.plant.motion = read_dataclass(SurfaceMotion, asked, "") if asked else None
-        return {}
 
-    def place_tissue(self, fields: dict) -> dict:
+    def place_tissue(self, fields: dict) -> None:
         """Control port: what the tip finds at its next new place; field ``name``, null for nothing."""
         name = fields.get("name")
         tissue = None if name is None else self._library[str(name)]
         self.plant.tissue_at = lambda _: tissue
-        return {}
 
     def truth(self, _: dict) -> dict:
         """Control port: the true state of the contact."""
@@ -248,14 +245,13 @@ def attach_cell(robot: SimulatedRobot, plant: Plant, cell: LoadCell, bus: TcpBus
         force_n, torque_nm = plant.wrench_at_cell()
         bus.send(cell.step((*force_n, *torque_nm), plant.time_s))
 
-    def inject(fields: dict) -> dict:
+    def inject(fields: dict) -> None:
         """Fields ``fault`` and ``value``; 0 ends it. ``server_gone`` drops clients."""
         fault = fields.get("fault")
         if fault == "server_gone":
             bus.drop_clients()
         else:
             cell.faults.inject(str(fault), number(fields.get("value"), "value"))
-        return {}
 
     robot.after_step.append(step)
     robot.orders["cell_fault"] = inject

@@ -6,7 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.simulation.plant.plant import CellMounting, Plant
+from tactile_resonance.contact.payload import Payload
+from tactile_resonance.contact.vectors import vector
+from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, RoundSurface, relative_radius_m
 from tactile_resonance.simulation.plant.tip import RigidTip, SprungIndenter, Tip
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -159,7 +161,7 @@ def test_nothing_there_is_nothing_felt():
 
 def test_cell_under_the_sample_feels_reaction_and_weight_wherever_the_tip_turns():
     centre = np.array([0.1, 0.01, -0.01])
-    p = plant(mounting=CellMounting(Mount.TABLE, carried_kg=0.2, centre_m=centre))
+    p = plant(mount=Mount.TABLE, carried=Payload(0.2, vector(centre)))
     p.step(at(0, 0, RADIUS_M), 0.002)
     p.step(at(0, 0, RADIUS_M - 4e-4, turn=(0.1, 0, 0)), 0.002)
     force, torque = p.wrench_at_cell()
@@ -171,7 +173,7 @@ def test_cell_under_the_sample_feels_reaction_and_weight_wherever_the_tip_turns(
 
 def test_cell_on_the_tool_feels_contact_weight_and_inertia_in_its_own_frame():
     centre = np.array([-0.03, 0, 0.01])
-    p = plant(mounting=CellMounting(Mount.TOOL, carried_kg=0.03, centre_m=centre))
+    p = plant(mount=Mount.TOOL, carried=Payload(0.03, vector(centre)))
     turn = (0.0, 0.3, 0.0)
     acceleration = np.array([0.2, 0.0, 0.5])
     for n in range(3):
