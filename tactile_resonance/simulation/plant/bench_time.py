@@ -206,30 +206,8 @@ class BenchTime:
 
     def run(self) -> None:
         """Step, serve and keep the pace until stopped; the ports stay open."""
-        if self.simulated:
-            self._run_simulated()
-        else:
-            self._run_on_the_wall_clock()
-
-    def _run_on_the_wall_clock(self) -> None:
-        due_ns, steps = time.perf_counter_ns(), 1
-        while not self._stopping:
-            wait_ns = due_ns - time.perf_counter_ns()
-            if wait_ns > 0:
-                self._reactor.serve(wait_ns * 1e-9, patient=False)
-                continue
-            self._reactor.serve(0.0)
-            due_ns = self._next_due(due_ns, time.perf_counter_ns())
-            self._reactor.gathers = steps > 1
-            for _ in range(steps):
-                self._step()
-            self._reactor.gathers = False
-            steps = self.at_once()
-            due_ns += (steps - 1) * self._step_ns
-
-    def _run_simulated(self) -> None:
-        due_ns = time.perf_counter_ns()
-        repeat_ns = due_ns
+        due_ns = repeat_ns = time.perf_counter_ns()
+        steps = 1
         while not self._stopping:
             demand = self.demand()
             if demand is not None and not self._all_packets():
@@ -238,21 +216,25 @@ class BenchTime:
             if demand is None:
                 # time stands: wait for messages, and send the newest data again now and then
                 self._reactor.serve(min(REPEAT_S, max(0.0, (repeat_ns - now_ns) * 1e-9)))
-                now_ns = time.perf_counter_ns()
-                if now_ns >= repeat_ns:
-                    repeat_ns = now_ns + round(REPEAT_S * 1e9)
+                due_ns = time.perf_counter_ns()
+                if due_ns >= repeat_ns:
+                    repeat_ns = due_ns + round(REPEAT_S * 1e9)
                     for call in self.repeats:
                         call()
-                due_ns = now_ns
                 continue
             if demand is Demand.REAL and due_ns > now_ns:
-                self._reactor.serve((due_ns - now_ns) * 1e-9)
+                self._reactor.serve((due_ns - now_ns) * 1e-9, patient=self.simulated)
                 continue
             self._reactor.serve(0.0)
             if self.demand() is None:
                 continue
             due_ns = self._next_due(due_ns, time.perf_counter_ns())
-            self._step()
+            self._reactor.gathers = steps > 1
+            for _ in range(steps):
+                self._step()
+            self._reactor.gathers = False
+            steps = 1 if self.simulated else self.at_once()
+            due_ns += (steps - 1) * self._step_ns
             repeat_ns = time.perf_counter_ns() + round(REPEAT_S * 1e9)
 
     def _all_packets(self) -> bool:
