@@ -365,26 +365,22 @@ def swing(held_n, slope, depth_m, speed_m_s, base_m, rate_m_s, h_s, k, c, m):
 @njit(
     UniTuple(float64, 5)(
         *(from_dtype(STATE)[::1], *[_MATRIX] * 5, float64[::1], UniTuple(float64, 3)),
-        *(*[float64] * 5, int64, int64),
+        *(*[float64] * 5, int64),
     ),
     cache=True,
 )
 def _swing(
-    states, t, inside, outside, into, out, rates, beam, base_m, rate, depth_m, speed, h_s, n, count
+    states, t, inside, outside, into, out, rates, beam, base_m, rate, depth_m, speed, h_s, count
 ):
-    """Swing from one number of sub-steps to another, or until there is no room for more nodes.
-
-    Returns depth and speed, force and radius, and how many sub-steps are done.
-    """
+    """Swing for some sub-steps; return depth and speed, force and radius, and how many nodes there are."""
     k, c, m = beam
     s = states[0]
-    while n < count and s.inside + s.outside + MAX_NODES_PER_STEP + 2 < inside.shape[0]:
+    for n in range(count):
         held_n, slope = _tangent(states, t, h_s)
         base_now_m = base_m + n * h_s * rate
         depth_m, speed = swing(held_n, slope, depth_m, speed, base_now_m, rate, h_s, k, c, m)
         _step(states, t, inside, outside, into, out, rates, depth_m, h_s)
-        n += 1
-    return depth_m, speed, s.force_n, s.a_m, float(n)
+    return depth_m, speed, s.force_n, s.a_m, float(s.inside + s.outside)
 
 
 Beam = tuple[float, float, float]
@@ -452,19 +448,19 @@ class Indenter:
         self._terms = np.zeros((SCRATCH + 1, moduli.size))
         self._terms[MODULI], self._terms[TIMES] = moduli, times
         self._free = _decays(moduli, times, e0)
-        # inside, x ascending, and outside, x descending
+        # inside, x ascending, and outside, x descending; how many there are on both sides
         self._nodes = tuple(np.zeros((2, NODES, VALUES + moduli.size)))
+        self._count = 0.0
 
     def step(self, depth_m: float, dt_s: float) -> float:
         """Move the tip to a depth at constant speed within `dt_s` and return the force [N]."""
         if not dt_s > 0:
             require(False, "dt_s", dt_s, "a number above 0")
+        self._make_room(1)
         self.depth_m = depth_m
-        self.force_n, self.contact_radius_m, nodes = _step(
+        self.force_n, self.contact_radius_m, self._count = _step(
             self._state, self._terms, *self._nodes, *self._free, depth_m, dt_s
         )
-        if nodes + MAX_NODES_PER_STEP + 2 >= len(self._nodes[0]):
-            self._make_room()
         return self.force_n
 
     def tangent(self, dt_s: float) -> tuple[float, float]:
@@ -476,20 +472,16 @@ class Indenter:
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
         """Move at the end of a beam for `count` times `h_s`, as the function `swing`; return its motion."""
-        done = 0
-        while done < count:
-            depth_m, speed_m_s, self.force_n, self.contact_radius_m, now = _swing(
-                *(self._state, self._terms, *self._nodes, *self._free),
-                *(beam, *base, *ball, h_s, done, count),
-            )
-            ball, done = (depth_m, speed_m_s), int(now)
-            if done < count:
-                self._make_room()
-        self.depth_m = ball[0]
-        return ball
+        self._make_room(count)
+        self.depth_m, speed_m_s, self.force_n, self.contact_radius_m, self._count = _swing(
+            *(self._state, self._terms, *self._nodes, *self._free), *(beam, *base, *ball, h_s, count)
+        )
+        return self.depth_m, speed_m_s
 
-    def _make_room(self) -> None:
-        self._nodes = tuple(np.concatenate([each, np.zeros_like(each)]) for each in self._nodes)
+    def _make_room(self, steps: int) -> None:
+        """Have room for the nodes of some steps."""
+        while self._count + steps * (MAX_NODES_PER_STEP + 2) >= len(self._nodes[0]):
+            self._nodes = tuple(np.concatenate([each, np.zeros_like(each)]) for each in self._nodes)
 
 
 AT_ONCE_S = 1e-9  # in which the first depth is reached: glassy, as no Prony term is that fast
