@@ -197,11 +197,6 @@ class Transducer:
         self._keep = 0.0  # of the low-pass, off
         self.reseed(seed)
 
-    @property
-    def overload_counts(self) -> list[int]:
-        """How often each axis went beyond its range, (6,)."""
-        return self._axes["overloads"].tolist()
-
     def set_low_pass(self, corner_hz: float) -> None:
         """Set the corner of the first-order low-pass [Hz]; 0: off."""
         self._keep = math.exp(-2 * math.pi * corner_hz * SAMPLE_PERIOD_S) if corner_hz > 0 else 0.0
@@ -251,6 +246,8 @@ SET_RATE, READ_RATE = 0x0F, 0x10
 SET_BIAS, READ_OVERLOADS = 0x11, 0x12
 
 RATES_HZ = (200, 10, 20, 50, 100, 200, 333, 500, 1000)
+DECIMATIONS = tuple(round(1 / (rate_hz * SAMPLE_PERIOD_S)) for rate_hz in RATES_HZ)
+"""Conversions from one wrench that is sent to the next."""
 FILTERS_HZ = (0, 500, 300, 200, 150, 100, 50, 40, 30, 20, 10, 5, 3, 2, 1)
 UNSUPPORTED, OUT_OF_RANGE = 1, 2
 WHILE_STREAMING = (STOP, SET_BIAS)
@@ -281,7 +278,6 @@ class LoadCell(Transducer):
         self._next_ids = (COMMAND_ID, *RESPONSE_IDS)
         self.streaming = False
         self._rate_code = self._filter_code = 0
-        self._decimation = _decimation(0)
         self._time_s: float | None = None
         self._ticks = self._sent = 0
         self._wrench: tuple[float, ...] = (0.0,) * 6
@@ -308,7 +304,7 @@ class LoadCell(Transducer):
             part = (self._time_s - start_s) / span_s
             self._counts, self._bits = self.convert(load, before, part)
             self._ticks += 1
-            if self.streaming and self._ticks % self._decimation == 0:
+            if self.streaming and self._ticks % DECIMATIONS[self._rate_code] == 0:
                 frames += self._wrench_frames(START)
         if load != before:
             # what is left of the span counts for the next call
@@ -363,12 +359,11 @@ class LoadCell(Transducer):
             good = parameters[0] < len(RATES_HZ)
             if good:
                 self._rate_code = parameters[0]
-                self._decimation = _decimation(self._rate_code)
             return _result(good)
         if command == READ_RATE:
             return bytes([self._rate_code])
         if command == READ_OVERLOADS:
-            return bytes(min(255, count) for count in self.overload_counts)
+            return bytes(min(255, count) for count in self._axes["overloads"].tolist())
         return bytes([0, UNSUPPORTED])
 
     def _wrench_frames(self, command: int) -> list[CanFrame]:
@@ -383,11 +378,6 @@ class LoadCell(Transducer):
         whole = response.ljust(16, b"\0")
         parts = zip(RESPONSE_IDS, (whole[:8], whole[8:]), strict=True)
         return [CanFrame(self._time_s or 0.0, can_id, part) for can_id, part in parts]
-
-
-def _decimation(rate_code: int) -> int:
-    """Conversions from one wrench that is sent to the next."""
-    return round(1 / (RATES_HZ[rate_code] * SAMPLE_PERIOD_S))
 
 
 def _result(good: bool) -> bytes:
