@@ -273,22 +273,3 @@ class GradientEntry:
             return library.gelatine(low + share * (high - low))
 
         return tissue_at
-
-
-@dataclass(frozen=True, kw_only=True)
-class FillingEntry(TissueEntry):
-    """Part of a file: what a region is filled with."""
-
-    gradient: GradientEntry | None = None
-    heterogeneity: HeterogeneityEntry | None = None
-
-    def material_of(self, library: TissueLibrary) -> Material:
-        """Return it; ``ValueError`` as `TissueEntry.tissue_of`."""
-        material: Material
-        if self.gradient is None:
-            material = uniform(self.tissue_of(library))
-        else:
-            given = [value for value in (self.tissue, self.gelatine_percent) if value is not None]
-            require(not given, "gradient", given, "no tissue beside a gradient")
-            material = build(self.gradient.gradient_of, "gradient", library)
-        return material if self.heterogeneity is None else self.heterogeneity.over(material)

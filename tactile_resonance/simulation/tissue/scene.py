@@ -24,11 +24,13 @@ from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import (
-    FillingEntry,
+    GradientEntry,
+    HeterogeneityEntry,
     Material,
     TissueEntry,
     TissueLibrary,
     mixture,
+    uniform,
 )
 
 Point = tuple[float, ...]
@@ -298,24 +300,19 @@ class PhantomScene:
             index = np.where(region.shape.contains(position), i, index)
         return index
 
-    def region_at(self, position_m: ArrayLike) -> Region | None:
-        """Return the region at one position (2 or 3 coordinates) [m], or None."""
-        index = int(self.region_index(position_m))
-        return None if index < 0 else self.regions[index]
-
     def tissue_at(self, position_m: ArrayLike) -> Tissue | None:
         """Return what the tip feels at one position (2 or 3 coordinates) [m], or None: nothing.
 
         Regions are looked up at the position itself; what is buried is felt from the surface
         straight above or below it.
         """
-        region = self.region_at(position_m)
-        if region is None:
+        index = int(self.region_index(position_m))
+        if index < 0:
             return None
         position = np.zeros(3)
         given = np.asarray(position_m, dtype=float)
         position[: given.size] = given
-        tissue = region.material(position)
+        tissue = self.regions[index].material(position)
         position[2] = 0.0
         for buried in self.buried:
             # Hertz contact of the preload, as in `hertz_contact`
@@ -360,14 +357,23 @@ def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RegionEntry(FillingEntry, ShapeEntry):
+class _RegionEntry(TissueEntry, ShapeEntry):
+    gradient: GradientEntry | None = None
+    heterogeneity: HeterogeneityEntry | None = None
     name: str | None = None
 
     def region(self, library: TissueLibrary) -> Region:
-        percent = self.gelatine_percent
+        percent, shape = self.gelatine_percent, self.shape()
+        if self.gradient is None:
+            material = uniform(self.tissue_of(library))
+        else:
+            given = [value for value in (self.tissue, percent) if value is not None]
+            require(not given, "gradient", given, "no tissue beside a gradient")
+            material = build(self.gradient.gradient_of, "gradient", library)
+        if self.heterogeneity is not None:
+            material = self.heterogeneity.over(material)
         called = "gradient" if percent is None else f"gel{percent:g}"
-        name = self.name or self.tissue or called
-        return Region(name, self.shape(), self.material_of(library))
+        return Region(self.name or self.tissue or called, shape, material)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -127,10 +127,11 @@ def test_later_regions_cover_earlier_ones(library):
             Region("nodule", Sphere((0.0, 0.0, -0.1), 0.2), uniform(library["gel16"])),
         ),
     )
-    assert scene.region_at((0.0, 0.15)).name == "nodule"  # height 0
-    assert scene.region_at((0.0, 0.15, -0.3)).name == "block"
-    assert scene.region_at((0.6, 0.0, -0.5)).name == "right"
-    assert scene.region_at((-0.6, 0.0, 0.5)) is None
+    places = [(0.0, 0.15, 0.0), (0.0, 0.15, -0.3), (0.6, 0.0, -0.5)]
+    found = [scene.regions[index].name for index in scene.region_index(places)]
+    assert found == ["nodule", "block", "right"]
+    assert scene.region_index((0.0, 0.15)) == scene.region_index((0.0, 0.15, 0.0))  # height 0
+    assert scene.region_index((-0.6, 0.0, 0.5)) == -1
 
 
 @pytest.mark.parametrize(
