@@ -92,7 +92,7 @@ def _sensor(bench: SimulatedBench, tissue, force: FloatArray, lines: Lines) -> F
     for value in force:
         if value > 0 and abs(value - now) > 1e-9:
             after = bench.coupled(tissue, force_n=value, hold_time_s=HOLD_S)
-            stream = stream.continued(after.modal, coupled.carry_state(stream.state, after))
+            stream.become(after.modal, coupled.carry_state(stream.state, after))
             coupled, now = after, value
         parts.append(stream.play(lines, round(STEP_S * lines.sample_rate_hz)))
     return np.concatenate(parts)

@@ -361,8 +361,8 @@ class VaryingStream:
         for begin, end in pairwise(ends):
             middle_s = start + float(begin + end) / 2 / rate_hz
             contact = self._coupled_at(middle_s)
-            state = self._coupled.carry_state(self._stream.state, contact)
-            self._coupled, self._stream = contact, self._stream.continued(contact.modal, state)
+            self._stream.become(contact.modal, self._coupled.carry_state(self._stream.state, contact))
+            self._coupled = contact
             parts.append(self._stream.play(lines, int(end - begin)))
         self._time = start + samples / rate_hz
         return np.concatenate(parts)

@@ -235,15 +235,13 @@ class ResponseStream:
         now_s = self._phase / self._lines.sample_rate_hz
         return steady_state(self._model, self._lines, now_s) + self._deviation
 
-    def continued(self, model: PoleResidueModel, state: ComplexArray) -> ResponseStream:
-        """Return a stream of another model that goes on from here, in a given state (K,)."""
-        other = ResponseStream(model, delay_s=self._delay_s, negligible_v=self._negligible_v)
-        other._phase, other._late = self._phase, self._late.copy()
+    def become(self, model: PoleResidueModel, state: ComplexArray) -> None:
+        """Go on from here as another model, in a given state (K,)."""
+        self._model, self._deviation = model, state
         if (lines := self._lines) is not None:
-            other._prepare(lines)
-            state = state - steady_state(model, lines, self._phase / lines.sample_rate_hz)
-        other._deviation = state
-        return other
+            self._prepare(lines)
+            now_s = self._phase / lines.sample_rate_hz
+            self._deviation = state - steady_state(model, lines, now_s)
 
     def play(self, lines: Lines, samples: int | None = None) -> FloatArray:
         """Return the response to the next samples of an excitation, one period by default.
