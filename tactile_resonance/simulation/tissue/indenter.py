@@ -33,6 +33,8 @@ NODE_SPACING = 1e-3  # of the profile, in tip radii; the error of unloading goes
 MAX_NODES_PER_STEP = 64
 NODES = 1024
 """Of the profile, for which there is room at first."""
+AT_ONCE = 8
+"""Sub-steps of a swing for which there is room at a time."""
 
 STATE = np.dtype(
     [
@@ -365,17 +367,17 @@ def swing(held_n, slope, depth_m, speed_m_s, base_m, rate_m_s, h_s, k, c, m):
 @njit(
     UniTuple(float64, 5)(
         *(from_dtype(STATE)[::1], *[_MATRIX] * 5, float64[::1], UniTuple(float64, 3)),
-        *(*[float64] * 5, int64),
+        *(*[float64] * 5, int64, int64),
     ),
     cache=True,
 )
 def _swing(
-    states, t, inside, outside, into, out, rates, beam, base_m, rate, depth_m, speed, h_s, count
+    states, t, inside, outside, into, out, rates, beam, base_m, rate, depth_m, speed, h_s, first, end
 ):
-    """Swing for some sub-steps; return depth and speed, force and radius, and how many nodes there are."""
+    """Swing for some of the sub-steps; return depth, speed, force, radius, and how many nodes there are."""
     k, c, m = beam
     s = states[0]
-    for n in range(count):
+    for n in range(first, end):
         held_n, slope = _tangent(states, t, h_s)
         base_now_m = base_m + n * h_s * rate
         depth_m, speed = swing(held_n, slope, depth_m, speed, base_now_m, rate, h_s, k, c, m)
@@ -472,10 +474,14 @@ class Indenter:
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
         """Move at the end of a beam for `count` times `h_s`, as the function `swing`; return its motion."""
-        self._make_room(count)
-        self.depth_m, speed_m_s, self.force_n, self.contact_radius_m, self._count = _swing(
-            *(self._state, self._terms, *self._nodes, *self._free), *(beam, *base, *ball, h_s, count)
-        )
+        for first in range(0, count, AT_ONCE):
+            end = min(first + AT_ONCE, count)
+            self._make_room(end - first)
+            *ball, self.force_n, self.contact_radius_m, self._count = _swing(
+                *(self._state, self._terms, *self._nodes, *self._free),
+                *(beam, *base, *ball, h_s, first, end),
+            )
+        self.depth_m, speed_m_s = ball
         return self.depth_m, speed_m_s
 
     def _make_room(self, steps: int) -> None:
