@@ -6,7 +6,6 @@ from __future__ import annotations
 import select
 import socket
 import struct
-from collections import defaultdict
 from collections.abc import Callable, Generator
 from inspect import GEN_RUNNING, getgeneratorstate
 from typing import NamedTuple
@@ -127,41 +126,32 @@ class Connection:
 
         `droppable` data are not sent at all while earlier data wait. False if they were dropped.
         """
-        if not self.is_open or (droppable and (self._unsent or self.frozen)):
+        late = self in self._reactor.unsent
+        if not self.is_open or (droppable and (late or self.frozen)):
             return False
-        if self._reactor.gathers:
-            self._reactor.gathered[self] += data
-            return True
         if len(self._unsent) > self._most_unsent:
             self.close()
             return False
-        if self._unsent or self.frozen:
-            self._unsent += data
-            self._reactor.unsent.add(self)
-            return True
-        try:
-            sent = self._socket.send(data)
-        except BlockingIOError:
-            sent = 0
-        except OSError:
-            self.close()
-            return False
-        if sent < len(data):
-            self._unsent += data[sent:]
-            self._reactor.unsent.add(self)
-        return True
+        self._unsent += data
+        if self._reactor.gathers:
+            self._reactor.gathered.add(self)
+        else:
+            self.flush()
+        return self.is_open
 
     def flush(self) -> None:
         """Send what waits, as far as the network takes it."""
-        if self.frozen:
-            return
         try:
-            del self._unsent[: self._socket.send(self._unsent)]
+            if not self.frozen:
+                del self._unsent[: self._socket.send(self._unsent)]
         except BlockingIOError:
             pass
         except OSError:
             self.close()
-        if not self._unsent:
+            return
+        if self._unsent:
+            self._reactor.unsent.add(self)
+        else:
             self._reactor.unsent.discard(self)
 
     def read(self) -> None:
@@ -217,16 +207,16 @@ class Reactor:
     frozen : bool
         Nothing passes the freezable ports.
     unsent : set of Connection
-        Those for which data wait.
-    gathered : dict
-        What waits to be sent together, by the connection.
+        Those whose network does not take all data at once.
+    gathered : set of Connection
+        Those for which data wait to be sent together.
     """
 
     def __init__(self, host: str) -> None:
         self.host = host
         self.frozen = self._gathers = False
         self.unsent: set[Connection] = set()
-        self.gathered: dict[Connection, bytearray] = defaultdict(bytearray)
+        self.gathered: set[Connection] = set()
         self._listeners: list[_Listener] = []
         self._connections: set[Connection] = set()
         # what is called where a descriptor can be read, and the descriptors as select takes them
@@ -243,8 +233,7 @@ class Reactor:
     def gathers(self, value: bool) -> None:
         self._gathers = value
         while self.gathered and not value:
-            connection, data = self.gathered.popitem()
-            connection.send(bytes(data))
+            self.gathered.pop().flush()
 
     def listen(
         self,
@@ -308,8 +297,8 @@ class Reactor:
 
     def forget(self, connection: Connection) -> None:
         """Stop serving a connection that is about to close."""
-        self._connections.discard(connection)
-        self.unsent.discard(connection)
+        for connections in (self._connections, self.unsent, self.gathered):
+            connections.discard(connection)
         self.renew()
 
     def close(self) -> None:

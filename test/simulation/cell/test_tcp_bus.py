@@ -278,6 +278,23 @@ def test_clients_that_are_dropped_may_come_back(served):
         assert client.say(b"< open can0 >") == b"< ok >"
 
 
+def test_a_client_that_is_dropped_by_what_it_says_is_forgotten_with_the_rest_of_it(served):
+    taken = []
+
+    def receive(can_id, data):
+        taken.append(data)
+        served.bus.drop_clients()
+        return [ANSWER]
+
+    served.bus = SocketcandServer(served.reactor, 0, receive)
+    with Talk(served) as client:
+        listening(served, client)
+        client.socket.sendall(b"< send 64 1 b >< send 64 1 c >")
+        assert client.ended()
+        assert not served.bus.clients
+    assert taken == [b"\x0b"]
+
+
 def test_a_serial_adapter_answers_as_lawicels(adapter):
     with Talk(adapter) as client:
         assert client.say(b"C\rS8\r") == b"\r\r"
