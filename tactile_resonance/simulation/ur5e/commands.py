@@ -62,7 +62,7 @@ class Program(CommandLoop):
     def _stop(self) -> Thread:
         """Stop what moves asynchronously, or stops so."""
         if self.kill("stop"):
-            self.end_asynchronous()
+            self.tell_asynchronous(begins=False)
         else:
             self._end_move()
         self._stop_linear |= self.integer(1) == 1
@@ -71,7 +71,7 @@ class Program(CommandLoop):
 
     def _end_move(self) -> None:
         if self.kill("move"):
-            self.end_asynchronous()
+            self.tell_asynchronous(begins=False)
 
     def _done(self, name: str, work: Thread) -> Thread:
         """Do a motion; where integer 1 says so as a thread, whose begin and end the client is told."""
@@ -81,9 +81,9 @@ class Program(CommandLoop):
             yield from work
 
     def _told(self, work: Thread) -> Thread:
-        self.begin_asynchronous()
+        self.tell_asynchronous(begins=True)
         yield from work
-        self.end_asynchronous()
+        self.tell_asynchronous(begins=False)
 
     def _keep(self, name: str, run: Callable[..., Thread], *arguments: Any) -> None:
         """Do a motion again and again; a newer one is taken up when the time of the last is over."""

@@ -119,7 +119,7 @@ class CommandLoop:
         A streaming command is done anew as long as it stands in the register; any other once, until
         the client has taken it away.
         """
-        self.end_asynchronous()
+        self.tell_asynchronous(begins=False)
         self.status(READY)
         executing = False
         while True:
@@ -203,16 +203,9 @@ class CommandLoop:
         for place, value in enumerate(values):
             self._registers.output_double[place + self.offset] = value
 
-    def begin_asynchronous(self) -> None:
-        """Tell that an asynchronous operation begins."""
-        self._operation = (self._operation + 1) % _COUNTER_SPAN
-        self._write_progress(_RUNNING)
-
-    def end_asynchronous(self) -> None:
-        """Tell that no asynchronous operation runs."""
-        self._write_progress(0)
-
-    def _write_progress(self, state: int) -> None:
+    def tell_asynchronous(self, *, begins: bool) -> None:
+        """Tell that an asynchronous operation begins, or that none runs."""
+        self._operation = (self._operation + begins) % _COUNTER_SPAN
         self._progress_writes = (self._progress_writes + 1) % _COUNTER_SPAN
-        word = (self._operation << 24) + (self._progress_writes << 16) + state
+        word = (self._operation << 24) + (self._progress_writes << 16) + begins * _RUNNING
         self._registers.output_int[2 + self.offset] = word
