@@ -58,14 +58,14 @@ class Service:
         while self._connection.is_open:
             wanted, rest = self._wanted, self._buffer
             whole: bytes | bool
-            if isinstance(wanted, Until):
-                message, whole, rest = rest.partition(wanted.end)
-                if not whole and len(message) > wanted.longest:
-                    raise ValueError(f"port {self._connection.port}: a message without end")
+            if isinstance(wanted, int):
+                message, whole, rest = rest[:wanted], len(rest) >= wanted, rest[wanted:]
             elif wanted is None:
                 message, whole, rest = rest, rest, b""
             else:
-                message, whole, rest = rest[:wanted], len(rest) >= wanted, rest[wanted:]
+                message, whole, rest = rest.partition(wanted.end)
+                if not whole and len(message) > wanted.longest:
+                    raise ValueError(f"port {self._connection.port}: a message without end")
             if not whole:
                 break
             self._buffer = rest
