@@ -107,7 +107,7 @@ def joined_spread(blocks: Sequence[tuple[float, ForceSpread, float]]) -> ForceSp
 
     Parameters
     ----------
-    blocks : sequence of (mean force [N], its spread, length [s])
+    blocks : sequence of (mean force [N], its spread, length in any one unit)
         Not known where more than a fifth of their time is not.
     """
     known = [block for block in blocks if math.isfinite(block[0] + block[1].rms_n)]

@@ -145,7 +145,7 @@ class ForceInfo:
     noise_rms_n, resolution_n, range_n : float
         Noise of one sample, smallest step, largest force [N].
     clock_uncertainty_s : float
-        Standard deviation of `WrenchSample.time_ns` against this machine's clock [s].
+        Standard deviation of `CellSample.time_ns` against this machine's clock [s].
     """
 
     name: str

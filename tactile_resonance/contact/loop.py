@@ -76,6 +76,7 @@ class ContactLoop:
         self._listener = listener
         self._next_ns = clock.now_ns()
         self._seen: ArmSample | None = None  # the arm, in the newest cycle
+        self._pose: ArmSample | None = None  # when it was seen last
         self._refused: ArmError | None = None  # what a command raised, reported in the next cycle
         self._stopped_ns: int | None = None
         self._owed: Command | None = None  # a stop of which the arm has not been seen to rest
@@ -151,9 +152,11 @@ class ContactLoop:
         except ForceError as error:
             fault = fault or error
         else:
-            if felt and arm is not None:
-                turn = turn_from_vector(arm.rotation_rad)
-                wrenches = self._force.mounting.to_tip(felt, arm.position_m, turn)
+            # those of a cycle without a state of the arm are told, too, as from where the tip was last
+            pose = self._pose = arm or self._pose
+            if felt and pose is not None:
+                turn = turn_from_vector(pose.rotation_rad)
+                wrenches = self._force.mounting.to_tip(felt, pose.position_m, turn)
         self._seen, self.fault = arm, fault
         # the arm keeps a velocity, so a stop is sent until it has worked, whatever state that ends in
         command = self.controller.step(now, arm, wrenches, fault) or self._owed

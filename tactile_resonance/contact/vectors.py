@@ -99,7 +99,7 @@ def turn_product(a: Turn, b: Turn) -> Turn:
     )
 
 
-@lru_cache(maxsize=2)  # force source, path and housing ask for the same one in each period
+@lru_cache(maxsize=2)  # loop, path and housing ask for the same one in each period
 def turn_from_vector(rotation_rad: Vector) -> Turn:
     """Return the rotation of a rotation vector [rad] (Rodrigues' formula); NaN where that is not finite."""
     x, y, z = rotation_rad

@@ -42,6 +42,8 @@ from tactile_resonance.drivers.ur_exchange import (
 from tactile_resonance.drivers.ur_session import Session
 
 LONGEST_MESSAGE = 8192
+# Characters of an error of the library that are told.
+MOST_TOLD = 1000
 # No command is given to a robot of which the owner has seen nothing for so long.
 HEALTHY_S = 0.1
 REFUSAL_S = 0.008
@@ -150,7 +152,7 @@ class Client:
             else:
                 self._led = name == "lead"
         except ArmError as error:
-            answer = error.fault, str(error)[len("arm: ") :]
+            answer = error.fault, str(error)[len("arm: ") :][:MOST_TOLD]
         self._stand()
         self._commands.send(pickle.dumps(answer))
 

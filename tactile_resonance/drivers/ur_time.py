@@ -33,7 +33,7 @@ def client_name() -> str:
 
 
 class AskedClock(SimulatedClock):
-    """Simulated time that is asked for whenever it is needed, and goes on without this clock."""
+    """Simulated time that is asked for whenever it is needed, by one thread, and goes on without this clock."""
 
     def now_ns(self) -> int:
         """Time now [ns]."""

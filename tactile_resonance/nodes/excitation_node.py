@@ -193,6 +193,8 @@ class ExcitationNode(ManagedNode):
             result.outcome = Measure.Result.CANCELLED
             result.message = f"cancelled after {counted(result.blocks, 'block')}"
         except (ValueError, OSError, DeviceError) as error:
+            if result.outcome == Measure.Result.NOT_READY and not isinstance(error, DeviceError):
+                result.outcome = Measure.Result.REFUSED
             # devices raise DeviceError: what the operating system refused has to do with the records
             result.message = f"{NO_RECORDS if isinstance(error, OSError) else ''}{error}"
             failed = result.outcome == Measure.Result.FAILED

@@ -103,7 +103,7 @@ class Goals:
         feedback: Callable[[Any], None] | None = None,
         refused: Callable[[], None] = lambda: None,
     ) -> ClientGoalHandle:
-        """Send a goal until it is accepted; waits for a node that is being brought back.
+        """Send a goal until it is accepted; waits for a node that is being brought back, unless `check` raises.
 
         `refused` is called after each refusal: nothing of this goal is under way then.
 

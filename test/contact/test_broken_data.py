@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.goal import Aim, State
-from tactile_resonance.contact.interfaces import ArmFault
+from tactile_resonance.contact.interfaces import ArmError, ArmFault
+from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.cell.transducer import CellParameters
@@ -127,6 +128,31 @@ def test_command_that_the_driver_refuses_ends_the_contact_with_its_reason():
     assert abs(made.speed_m_s[-1]) < 1e-5
     made.bench.arm.speed = hears
     assert made.loop.retract().retracted
+
+
+def test_forces_are_told_while_no_state_of_the_arm_comes():
+    """Who looks on sees them all the more then: a supervisor may have to act."""
+    made, told = contact(SOFT), []
+    made.loop = ContactLoop(
+        made.bench.arm, made.bench.cell, made.bench.clock, made.controller, told.append
+    )
+    made.loop.make(made.goal)
+    made.loop.run_while(lambda: True, 0.2)
+    sees = made.bench.arm.state
+
+    def state():
+        raise ArmError(ArmFault.COMMAND_REFUSED, "no answer to a command")
+
+    made.bench.arm.state = state
+    del told[:]
+    made.loop.run_while(lambda: True, 0.02)
+    made.bench.arm.state = sees
+    assert {cycle.arm for cycle in told} == {None}
+    forces = [wrench.force_n[2] for cycle in told for wrench in cycle.wrenches]
+    assert len(forces) >= 10
+    # the arm is told to stop, and stands: the force stays what it was, and so does its zero
+    zero_n = told[0].bias_n[2]
+    assert np.mean(forces) - zero_n == pytest.approx(FORCE_N, rel=0.2)
 
 
 def test_tissue_that_rises_while_the_zero_is_taken_is_met_by_a_stop():

@@ -84,22 +84,23 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("raises", "outcome"),
+    ("raises", "kind", "outcome"),
     [
-        ("plan", Measure.Result.REFUSED),
-        ("configure", Measure.Result.NOT_READY),
-        ("", Measure.Result.REFUSED),
-        ("arm", Measure.Result.FAILED),
+        ("plan", DeviceError, Measure.Result.REFUSED),
+        ("configure", DeviceError, Measure.Result.NOT_READY),
+        ("configure", ValueError, Measure.Result.REFUSED),
+        ("", DeviceError, Measure.Result.REFUSED),
+        ("arm", DeviceError, Measure.Result.FAILED),
     ],
 )
 def test_what_an_error_means_is_a_matter_of_how_far_the_measurement_came(
-    monkeypatch, tmp_path, raises, outcome
+    monkeypatch, tmp_path, raises, kind, outcome
 ):
     class Device(SimpleNamespace):
         def __getattr__(self, name):
             def call(*arguments):
                 if name == raises:
-                    raise DeviceError(f"device: cannot {name}")
+                    raise kind(f"device: cannot {name}")
                 return arguments[0] if arguments else None
 
             return call

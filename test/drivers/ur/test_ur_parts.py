@@ -2,6 +2,7 @@
 """Parts of the arm's driver that need no robot: page, commands, states, motion, configuration, fault names."""
 
 import itertools
+import pickle
 import socket
 import tempfile
 import threading
@@ -54,6 +55,15 @@ def test_commands_arrive_as_they_were_said(command):
     assert (
         data[:1] == command.kind
     )  # by which the client passes over velocities that were overtaken
+
+
+def test_a_configuration_arrives_at_the_client_process_as_it_was_read():
+    config = read_ur_config(share_path("config/devices/ur5e.yaml"))
+    data = pickle.dumps(config)
+    assert data[:1] == pickle.PROTO  # by which the client distinguishes requests from commands
+    assert data[:1] not in {SPEED, STOP, NOTHING}
+    again = pickle.loads(data)
+    assert repr(again) == repr(config)
 
 
 def test_each_side_of_the_page_reads_what_the_other_wrote_and_its_own_stays(exchanges):
