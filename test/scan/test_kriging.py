@@ -215,3 +215,24 @@ def test_of_many_points_tiles_predict_what_all_points_together_do():
     assert np.sqrt(np.mean((value - together) ** 2)) < 0.2 * np.median(std_together)
     assert 0.8 < np.median(std / std_together) < 1.4
     assert 0.9 < np.mean(np.abs(value - truth) < 1.96 * std) <= 1
+
+
+@pytest.mark.parametrize("count", [25, 30, 33, 40, 50])
+def test_something_small_in_a_large_map_is_neither_smoothed_away_nor_sure(count):
+    """A bump of 10 Hz in a flat map, of a grid touched row by row; a point's noise is 0.05 Hz."""
+    rng = np.random.default_rng(11)
+    axis = 1e-3 * np.arange(count)
+    xy = np.array([(x, y) for k, y in enumerate(axis) for x in (axis, axis[::-1])[k % 2]])
+    middle = xy.mean(axis=0) + [0.003, 0.002]
+
+    def truth(at):
+        return 250 + 10 * np.exp(-np.sum((at - middle) ** 2, axis=-1) / (2 * 0.0015**2))
+
+    noise = np.full(len(xy), 0.05)
+    at = middle + rng.uniform(-0.003, 0.003, (200, 2))
+    value, std = krige_many(xy, truth(xy) + noise * rng.standard_normal(len(xy)), noise).predict(at)
+    off = value - truth(at)
+    assert np.max(np.abs(off)) < 0.6
+    assert np.sqrt(np.mean((off / std) ** 2)) < 3
+    with pytest.raises(ValueError, match="one place twice"):
+        krige_many(np.concatenate([xy, xy[:1]]), truth(np.concatenate([xy, xy[:1]])), np.zeros(len(xy) + 1))
