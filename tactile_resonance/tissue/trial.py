@@ -61,17 +61,27 @@ class Trial:
     def share(self, which: BoolArray) -> str:
         """How many of the points are `which` (n,), with the limits of that share."""
         count, of = int(np.sum(which)), len(which)
-        low, high = share_limits(count, of, np.unique(self.preparation).size)
+        low, high = share_limits(count, of, effective_groups(self.preparation))
         share = f"{count / of:.2%}" if of else "-"
         return f"{count} of {of} ({share}, {low:.2%} to {high:.2%})"
 
 
+def effective_groups(group: Texts) -> float:
+    """Of how many groups of one size a share scatters as of these, whose points (n,) share their fate.
+
+    Their number where they are of one size, fewer where some rule (Kish, Survey Sampling, 1965, section 11.7).
+    """
+    sizes = np.unique(group, return_counts=True)[1]
+    return float(sizes.sum() ** 2 / np.sum(sizes**2)) if len(sizes) else 0.0
+
+
 def share_limits(
-    count: int, of: int, groups: int, confidence: float = 0.95
+    count: int, of: int, groups: float, confidence: float = 0.95
 ) -> tuple[float, float]:
     """Clopper and Pearson's interval of points out of points, as if each group had been counted once.
 
-    That is right where points of a group share their fate, and wide where they do not.
+    That is right where points of a group share their fate, and wide where they do not; `groups` as of
+    `effective_groups`.
     """
     if not of:
         return 0.0, 1.0
@@ -176,7 +186,7 @@ def reliability(trial: Trial, confidence: float = 0.95) -> tuple[ReliabilityBin,
         if not chosen.any():
             continue
         stated = float(counted.probability[chosen].mean())
-        groups = np.unique(counted.preparation[chosen]).size
+        groups = max(1, int(effective_groups(counted.preparation[chosen]) + 1e-9))
         low, high = stats.binom.interval(1 - beyond, groups, stated)
         share = float(right[chosen].mean())
         limits = float(low) / groups, float(high) / groups

@@ -17,7 +17,14 @@ from tactile_resonance.tissue.references import (
     read_sources,
 )
 from tactile_resonance.tissue.spread import spreads_of
-from tactile_resonance.tissue.trial import Trial, call_points, leave_out, reliability, share_limits
+from tactile_resonance.tissue.trial import (
+    Trial,
+    call_points,
+    effective_groups,
+    leave_out,
+    reliability,
+    share_limits,
+)
 
 STEP = np.array([2.5, 2.5e-3])  # 2 % w/w
 TWO_GELATINES = Path("config/scenes/two_gelatines.yaml")
@@ -86,6 +93,26 @@ def test_shares_count_groups_that_share_their_fate_once():
     assert (low, high) == pytest.approx((exact.low, exact.high))
     assert share_limits(60, 60, 60)[1] == 1.0
     assert share_limits(0, 0, 0) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("sizes", [[20] * 10, [100] + [1] * 9, [50, 50] + [2] * 8])
+@pytest.mark.parametrize("true", [0.5, 0.9])
+def test_a_share_that_few_preparations_rule_is_as_uncertain_as_they_make_it(sizes, true):
+    """Preparations share their fate and are of unequal size: limits of 95 % hold the truth as often, of 400."""
+    rng, group = np.random.default_rng(8), np.repeat([f"{k}" for k in range(len(sizes))], sizes)
+    made = Trial(group, *(np.zeros(len(group), kind) for kind in ("U9", bool, float, "U9", float)), group)
+    held, bins_hold = 0, 0
+    for _ in range(400):
+        right = np.repeat(rng.random(len(sizes)) < true, sizes)
+        low, high = share_limits(int(right.sum()), len(group), effective_groups(group))
+        assert f"{low:.2%} to {high:.2%}" in made.share(right)
+        held += low <= true <= high
+        likely = np.where(right, group, "another")
+        stated = np.full(len(group), true)
+        trial = replace(made, likely=likely, called=likely, known=np.ones(len(group), bool), probability=stated)
+        bins_hold += all(each.holds for each in reliability(trial))
+    assert held >= stats.binom.ppf(0.001, 400, 0.95)
+    assert bins_hold >= stats.binom.ppf(0.001, 400, 0.95)
 
 
 @pytest.mark.parametrize("preparations", [3, 12])
