@@ -33,7 +33,7 @@ from tactile_resonance.tissue.nominal_contact import (
     NominalContact,
     sensitivity_of_preloads,
 )
-from tactile_resonance.tissue.spread import LEVELS, SpreadSource, TissueSpread
+from tactile_resonance.tissue.spread import DEGREES_DIGITS, LEVELS, SpreadSource, TissueSpread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,7 +276,7 @@ def library_text(
         mean = {"f0_hz": _rounded(spread.mean[0]), "damping_ratio": _rounded(spread.mean[1])}
         classes[spread.name] = mean | _entry(spread.covariance)
         if math.isfinite(spread.degrees_of_freedom):
-            degrees = round(float(spread.degrees_of_freedom), 2)
+            degrees = round(float(spread.degrees_of_freedom), DEGREES_DIGITS)
             classes[spread.name]["degrees_of_freedom"] = degrees
         sources[spread.name] = {
             source.name: {

@@ -20,6 +20,8 @@ from tactile_resonance.tissue.classify import TissueClass, predictive_class
 Texts = npt.NDArray[np.str_]
 LEVELS = ("preparation", "position", "repetition")
 """Sources of spread, outermost first: figure 9 of arXiv 1805.00682, without its periods."""
+DEGREES_DIGITS = 2
+"""To which degrees of freedom are kept in files."""
 _PERCENT = re.compile(r"(\d+(?:\.\d+)?)\s*%")
 # A correlation beyond is not relied on: what is left across it is rounding and chance.
 _LEAST_EIGENVALUE = 1e-4
@@ -140,8 +142,8 @@ class TissueSpread:
 
     @property
     def usable(self) -> bool:
-        """Whether there are points enough for a class."""
-        return self.degrees_of_freedom > 1
+        """Whether there are points enough for a class: of two points rounding alone would decide."""
+        return round(self.degrees_of_freedom, DEGREES_DIGITS) > 1
 
     def as_class(self) -> TissueClass:
         """The class, with the predictive distribution of so few samples.

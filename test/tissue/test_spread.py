@@ -139,6 +139,16 @@ def test_degrees_of_freedom_of_single_measurements_are_those_of_their_scatter():
     np.testing.assert_allclose(spread.covariance, 10 / 9 * np.cov(points.estimate.T))
 
 
+def test_two_points_are_no_class_whatever_rounding_makes_of_their_one_degree_of_freedom():
+    rng = np.random.default_rng(9)
+    for _ in range(20):
+        (spread,) = spreads_of(drawn(rng, [(1,), (1,)]))
+        assert spread.degrees_of_freedom == pytest.approx(1)
+        assert not spread.usable
+        with pytest.raises(ValueError, match="degrees_of_freedom: got .* accepted is more than 1"):
+            spread.as_class()
+
+
 def test_refusals():
     points = drawn(np.random.default_rng(8), [(1,)])
     (one,) = spreads_of(points)
