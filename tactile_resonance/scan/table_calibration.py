@@ -173,9 +173,9 @@ def calibrate_table(
     _, touches = find_surface(wanted, ball_radius_m, request.heading_rad, touch)
     wider = [replace(t, std_m=math.hypot(t.std_m, request.flatness_m)) for t in touches]
     surface = fit_touches(wider, "plane", ball_radius_m)
-    covariance = _covariance(surface, request.height_m)
-    if not surface.consistent:
+    if not surface.consistent:  # first: their residuals would be taken for points that lie too close together
         raise ValueError(f"touches: {_contradiction(surface, wider, ball_radius_m)}")
+    covariance = _covariance(surface, request.height_m)
     slope_x, slope_y = surface.coefficients_m[1:] / surface.scale_m
     slope = math.hypot(slope_x, slope_y)
     tilt = math.atan(slope)

@@ -207,6 +207,18 @@ def test_a_touch_that_is_none_is_named():
     assert np.all(np.abs(made.correction - [1e-3, 0.01, 0.01]) < 4 * made.std)
 
 
+@pytest.mark.parametrize("off_m", [1e-3, 2e-3])
+def test_a_touch_that_is_far_off_is_not_laid_to_the_points(off_m):
+    """Its residual makes the tilts uncertain, which is no fault of where the touches are."""
+    touches = touches_on(moved(KNOWN, 1e-3, 0.01, 0.01), KNOWN, SIX)
+    x, y, z = touches[2].ball_m
+    touches[2] = replace(touches[2], ball_m=(x, y, z + off_m))
+    with pytest.raises(ValueError, match="touches: .* touch 3 lies .* off the plane of the others"):
+        table_from_touches(request(SIX), KNOWN, RADIUS_M, touches)
+    with pytest.raises(ValueError, match="touches: .* more touches would show which"):
+        table_from_touches(request(SIX[:4]), KNOWN, RADIUS_M, touches[:4])
+
+
 def test_a_table_tilted_further_than_accepted_is_refused():
     touches = touches_on(moved(KNOWN, 0.0, 0.04, 0.0), KNOWN, SIX)
     with pytest.raises(ValueError, match=r"tilt of the table \[rad\]: got 0\.04; .*most_tilt_rad"):
