@@ -22,6 +22,9 @@ from tactile_resonance.fields import check_above_zero, check_not_negative, requi
 
 NAN = float("nan")
 _BEND = 1 / 3  # see `refer_to_nominal`
+# A force without a deviation that is farther from the nominal one than so many of `unknown_force_std_n` is not
+# one that these describe.
+_CONTRADICTED = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +195,14 @@ def _equivalent_force(
     if math.isfinite(force_n) and math.isfinite(std_n):
         variance = std_n**2 + (nominal.force_scale_std * force_n) ** 2
     else:
-        force_n, std_n = nominal.force_n, nominal.unknown_force_std_n
+        told_n, (force_n, std_n) = force_n, (nominal.force_n, nominal.unknown_force_std_n)
         if math.isnan(std_n):
             return "the force is unknown, and nominal_contact has no unknown_force_std_n"
+        if abs(told_n - force_n) > _CONTRADICTED * std_n:
+            return (
+                f"the force is {1e3 * told_n:.3g} mN, its standard deviation unknown, which "
+                f"unknown_force_std_n of nominal_contact contradicts: {1e3 * force_n:g} +- {1e3 * std_n:g} mN"
+            )
         variance = std_n**2
         notes.append(f"force unknown, taken as {1e3 * force_n:g} +- {1e3 * std_n:g} mN")
     log_age, log_age_std = 0.0, 0.0

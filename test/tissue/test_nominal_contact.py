@@ -220,6 +220,12 @@ def test_an_unknown_force_is_no_shift_and_wide_or_no_statement():
     )
     np.testing.assert_array_equal(unsure.compared, x)
     assert unsure.note == at.note
+    # unless it is far from what is stated of forces that were not measured
+    loud = ContactLoad(25e-3, np.nan, AGE_S)
+    far = refer_to_nominal(poles(force_n=25e-3), NOISE, loud, nominal(unknown_force_std_n=3e-4))
+    assert np.isnan(far.compared).all()
+    assert not far.referred
+    assert far.note.startswith("the force is 25 mN, its standard deviation unknown")
     # nothing says how far it may be off: nothing is said of the tissue, the pole stays
     none = refer_to_nominal(x, NOISE, unknown, nominal())
     assert not none.referred
