@@ -166,7 +166,7 @@ class Clusters:
     covariance : (K, 2, 2) float
         Of each group, without noise.
     probability : (n, K) float
-        With which each point belongs to each.
+        With which each point belongs to each, if the groups are as they were found: of few points too sure.
     bic : (Kmost,) float
         Bayesian information criterion of one group, two groups and so on, of fewer than 25 points as of 25; the
         number chosen has the least.
