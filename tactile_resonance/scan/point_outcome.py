@@ -214,6 +214,8 @@ def judge_drift(
 ) -> tuple[SensorHealth, str]:
     """Whether the poles in air moved during the scan: beyond their uncertainty and beyond the limits.
 
+    Steady is what would have shown a change by a few limits; with more uncertainty than that nothing is known.
+
     Returns
     -------
     health : SensorHealth
@@ -241,6 +243,8 @@ def judge_drift(
             SensorHealth.DRIFTED,
             f"warning: the sensor drifted, poles relative to air are off by as much: {figures}",
         )
+    if np.any(std > most):
+        return SensorHealth.UNKNOWN, f"sensor health unknown, less certain in air than the limits: {figures}"
     return SensorHealth.STEADY, f"sensor steady: {figures}"
 
 

@@ -72,7 +72,11 @@ def test_uncertainty_relative_to_air_is_that_of_both():
         ({"f0_hz": 246.53}, SensorHealth.DRIFTED),
         ({"damping_ratio": 0.01210}, SensorHealth.DRIFTED),
         ({"f0_hz": 246.56}, SensorHealth.STEADY),  # significant, and less than anybody minds
-        ({"f0_hz": 246.3, "f0_std_hz": 0.2}, SensorHealth.STEADY),  # large, and nothing but noise
+        ({"f0_hz": 246.51, "f0_std_hz": 0.04}, SensorHealth.STEADY),  # beyond the limit, and may be noise
+        # a change by ten limits would look alike
+        ({"f0_hz": 246.3, "f0_std_hz": 0.2}, SensorHealth.UNKNOWN),
+        ({"damping_std": 6e-5}, SensorHealth.UNKNOWN),
+        ({"f0_hz": 245.0, "f0_std_hz": 0.2}, SensorHealth.DRIFTED),
         ({"f0_std_hz": np.nan}, SensorHealth.UNKNOWN),
     ],
 )
