@@ -271,8 +271,10 @@ def krige(
 
 
 def _check_values(xy: FloatArray, y: FloatArray, noise: FloatArray) -> None:
-    good = bool(np.all(np.isfinite(xy)) and np.all(np.isfinite(y)) and np.all(noise >= 0))
-    require(good and bool(np.all(np.isfinite(noise))), "values", "NaN", "finite numbers")
+    good = bool(np.all(np.isfinite(xy)) and np.all(np.isfinite(y)))
+    require(good, "xy_m, values", "some that are not finite", "finite numbers")
+    wrong = noise[~((noise >= 0) & np.isfinite(noise))]
+    require(not wrong.size, "noise_std", wrong.tolist()[:1], "finite numbers, 0 or above")
 
 
 def _scale(y: FloatArray) -> float:
