@@ -14,6 +14,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
 
 UNKNOWN = "unknown"
+_LEAST_SCATTER = 1e-9  # of points across their line, as a part of their variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +86,11 @@ def class_from_samples(name: str, points: npt.ArrayLike, prior: float = 1.0) -> 
     x = np.asarray(points, float)
     good = x.ndim == 2 and x.shape[1] == 2 and len(x) >= 4 and bool(np.all(np.isfinite(x)))
     require(good, "points", x.shape, "shape (n, 2) with n at least 4, finite")
-    n = len(x)
-    return predictive_class(name, x.mean(axis=0), (1 + 1 / n) * np.cov(x.T), n - 1.0, prior)
+    n, scatter = len(x), np.cov(x.T)
+    # equal or rounded figures: no spread was measured, and whatever is not on their line would be unknown
+    shown = bool(np.all(np.ptp(x, axis=0) > 0)) and np.linalg.det(scatter / _unit(scatter)) > _LEAST_SCATTER
+    require(shown, "points", x[:4].tolist(), "points that scatter in f0 and in damping ratio, not on one line")
+    return predictive_class(name, x.mean(axis=0), (1 + 1 / n) * scatter, n - 1.0, prior)
 
 
 def predictive_class(

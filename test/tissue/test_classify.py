@@ -102,6 +102,20 @@ def test_a_class_from_few_samples_predicts_its_next_member():
         assert share == pytest.approx(level, abs=4 * np.sqrt(level * (1 - level) / runs))
 
 
+@pytest.mark.parametrize(
+    "points",
+    [
+        [[250.0, 0.03]] * 4,  # one point four times
+        [[249.7, 0.03], [250.1, 0.03], [250.4, 0.03], [249.9, 0.03]],  # rounded
+        [[249.7, 0.029], [250.1, 0.031], [249.7, 0.029], [250.1, 0.031]],  # two points, each twice
+        np.array([250.0, 0.03]) + np.outer([-0.3, 0.1, 0.4, 0.7, 0.2], [1.0, 2.5e-3]),
+    ],
+)
+def test_points_that_show_no_spread_are_no_class(points):
+    with pytest.raises(ValueError, match="points: got .* accepted is points that scatter"):
+        class_from_samples("a", points)
+
+
 def test_gaussian_density_of_student_with_many_degrees():
     wide = tissue("a", 250.0, 0.03)
     student = TissueClass("b", wide.mean, wide.spread, degrees_of_freedom=1e7)
