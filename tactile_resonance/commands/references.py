@@ -166,10 +166,13 @@ def _build(options: argparse.Namespace) -> int:
     steps = smallest_steps(spreads)
     for step in steps:
         outer = list(step.one_block)[-1]
+        own = [spread for spread in spreads if spread.name in (step.first, step.second)]
+        missing = dict.fromkeys(name for spread in own for name in spread.undetermined)
+        but = f" but {', '.join(missing)}, not determined," if missing else ""
         print(
             f"smallest step from {step.from_percent:g} to {step.to_percent:g} %, separated at 99 %: "
             f"{step.one_block['noise']:.2g} % by noise of one block, {step.one_block[outer]:.2g} % with all "
-            f"sources, {step.limit[outer]:.2g} % without noise"
+            f"sources{but or ','} {step.limit[outer]:.2g} % without noise"
         )
     if options.figure:
         save_figure(draw_references(points, spreads, bins, steps, _simulated(runs)), options.figure)

@@ -108,6 +108,14 @@ def test_a_library_of_runs_serves_a_scene(runs, tmp_path, capsys):
         assert 0.5 < np.sqrt(each.spread[0, 0]) / STD[0] < 2.5
 
 
+def test_the_smallest_step_names_a_source_that_is_not_in_it(runs, tmp_path, capsys):
+    build = ["--labels", "scene", "--nominal", NOMINAL, "--output", tmp_path / "library.yaml"]
+    printed = called(["references", "build", runs[0], *build], capsys)
+    assert "% with all sources but preparation, not determined, " in printed
+    printed = called(["references", "build", *runs[:3], *build], capsys)
+    assert "% with all sources, " in printed
+
+
 def test_a_library_is_checked_on_another_run(runs, tmp_path, capsys):
     library = tmp_path / "library.yaml"
     called(
