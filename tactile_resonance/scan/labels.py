@@ -99,10 +99,19 @@ def run_names(runs: Sequence[RunContent]) -> list[str]:
     Raises
     ------
     ValueError
-        If two are alike.
+        If two are alike, or hold the same measurement to the last digit: copies, or simulations of one seed,
+        would count as independent.
     """
     names = [run.path.resolve().name for run in runs]
     require(len(set(names)) == len(names), "runs", names, "folders of different names")
+    seen: dict[tuple[float, ...], str] = {}
+    for name, run in zip(names, runs, strict=True):
+        for result in run.latest:
+            if result.kind is PointKind.TISSUE and not result.failed:
+                key = (*result.estimate.tolist(), *result.std.tolist())
+                first = seen.setdefault(key, name)
+                same = f"point {result.index} of {name} as in {first}"
+                require(first == name, "runs", same, "no copy, and none of the same seed")
     return names
 
 
