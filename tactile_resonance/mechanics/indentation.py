@@ -199,11 +199,15 @@ def means_of(test: IndentationRecord) -> Means:
         got, accepted = f"{hold_s:.3g} s", f"one as long as the ramp, {ramp_s:.3g} s, or longer"
         require(hold_s >= ramp_s, "hold", got, accepted)
     edges = [first, *_even(time, first, ramp, RAMP_PARTS)]
-    edges += _growing(time, ramp, last + 1, (time[ramp] - time[first]) / RAMP_PARTS)
-    turn = len(edges) - 2
+    shortest_s = (time[ramp] - time[first]) / RAMP_PARTS
+    edges += _growing(time, ramp, last + 1, shortest_s)
     off = np.flatnonzero(depth[last:] < -CLEAR_M)
     clear = last + int(off[0]) if off.size else depth.size
+    turn = len(edges) - 2
     if test.protocol is Protocol.INDENTATION:
+        # between means the way is a line: a long one before the turn would begin to draw back too early
+        edges[-1:] = _shrinking(time, edges[-2], last + 1, shortest_s)
+        turn = len(edges) - 2
         edges += _even(time, last + 1, clear, RAMP_PARTS)
     taken = np.asarray(edges)
     time_s, depth_m, force_n = (_mean(v, taken) for v in (time, depth, force))
@@ -280,3 +284,10 @@ def _growing(time: FloatArray, begin: int, end: int, shortest_s: float) -> list[
     parts = np.log1p(since * (GROWTH - 1) / shortest_s) / np.log(GROWTH)
     found = np.flatnonzero(np.diff(np.floor(parts)) > 0) + begin + 1
     return [*(int(i) for i in found), end]
+
+
+def _shrinking(time: FloatArray, begin: int, end: int, shortest_s: float) -> list[int]:
+    """Ends of parts that grow with the time before the last sample."""
+    count = time.size
+    back = _growing(-time[::-1], count - end, count - begin, shortest_s)
+    return [*(count - i for i in reversed(back[:-1])), end]

@@ -164,6 +164,22 @@ def test_a_drift_that_the_record_does_not_show_is_noted():
     assert any("taken not to drift" in note for note in fit_indentation(replace(test, **columns)).status)
 
 
+@pytest.mark.parametrize("rate_hz", [200.0, 500.0])
+def test_means_of_a_hold_do_not_begin_to_draw_back_before_it_ends(rate_hz):
+    """Of exact forces nothing is left by the means but a fraction of the deviations of usual noise."""
+    ball = BallTip(RADIUS_M)
+    truth = Prony(4e3, np.array([3e3, 2e3]), np.array([0.5, 4.0]))
+    time = np.arange(-0.5, 23.0, 1 / rate_hz)
+    depth = np.interp(time, [-0.5, 0.3, 20.3, 22.3], [-5e-4 / 0.3, 1e-3, 1e-3, -1e-3])
+    turn = int(np.flatnonzero(depth >= 1e-3 * (1 - 1e-9))[-1])
+    force, _ = force_over(ball, time, depth, truth, turn)
+    test = IndentationRecord(Protocol.INDENTATION, time, force, depth, ball, noise_n=2e-4)
+    fit = fit_indentation(test, most_terms=2)
+    assert fit.chi_square < 5
+    assert np.abs(deviations(fit, truth)).max() < 0.3
+    assert abs(np.log(fit.modulus(5.0)[0] / truth.relaxation_modulus(5.0))) < 1e-3
+
+
 @pytest.mark.parametrize("thickness_m", [0.0, -1e-3, np.inf])
 def test_a_thickness_is_above_zero(thickness_m):
     test = relaxation(STANDARD, np.random.default_rng(1), hold_s=3.0)
