@@ -231,6 +231,8 @@ class SeriesProblem:
     ball : BallTip
     means : Means
         Of the record.
+    knows_zero : bool
+        Whether it begins or ends in air, or the deviation of its zero is stated.
     shows_drift : bool
         Whether it begins and ends in air.
     """
@@ -245,8 +247,9 @@ class SeriesProblem:
         self._small_pa = 1e-2 * self._scale_pa
         self._tried_s = means.ramp_s / 15, 2 * means.hold_s
         free = means.free_time_s
-        self._shows_zero = bool((free < means.begin_s).any())
-        self.shows_drift = self._shows_zero and bool((free > means.end_s).any())
+        self._shows_zero = free.size > 0
+        self.knows_zero = self._shows_zero or not np.isnan(test.force_std_n)
+        self.shows_drift = bool((free < means.begin_s).any() and (free > means.end_s).any())
 
     def solve(self, terms: int, fewer: SeriesSolution | None) -> SeriesSolution | None:
         """Best of several starts; None where none converges."""
@@ -366,7 +369,7 @@ class SeriesProblem:
         if not self._shows_zero:
             priors.append(zero / (max(test.force_std_n, 1e-9) if test.force_std_n >= 0 else 1e-9))
         if not self.shows_drift:
-            priors.append(drift * means.end_s / 1e-9)
+            priors.append(drift * (means.end_s - means.begin_s) / 1e-9)
         return np.concatenate(
             [
                 (means.force_n - zero - drift * at - force) / means.std_n,

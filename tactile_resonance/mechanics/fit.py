@@ -288,7 +288,7 @@ def _result(
         contact_ratio=ratio,
         sphere_share=sphere,
         layer_share=layer,
-        status=_status(best.chi_square / dof, ratio, sphere, layer, problem.shows_drift),
+        status=_status(best.chi_square / dof, ratio, sphere, layer, problem),
     )
 
 
@@ -317,10 +317,12 @@ def _moved(best: SeriesSolution, further: SeriesSolution) -> FloatArray:
 
 
 def _status(
-    reduced: float, ratio: float, sphere: float, layer: float, shows_drift: bool
+    reduced: float, ratio: float, sphere: float, layer: float, problem: SeriesProblem
 ) -> tuple[str, ...]:
     said = []
-    if not shows_drift:
+    if not problem.knows_zero:
+        said.append("no force in air: its zero is taken as exact, and deviations leave it out")
+    if not problem.shows_drift:
         said.append(
             "the record does not begin and end in air: its force is taken not to drift, and deviations leave "
             "a drift out"

@@ -7,7 +7,7 @@ from scipy.stats import binom
 
 from benchmarks.mechanics import RADIUS_M, errors_of, force_over, relaxation
 from tactile_resonance.mechanics.fit import Known, fit_indentation
-from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol, means_of
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.simulation.tissue.library import read_tissues
 
@@ -162,6 +162,40 @@ def test_a_drift_that_the_record_does_not_show_is_noted():
     held = test.time_s < 10.0
     columns = {name: getattr(test, name)[held] for name in ("time_s", "force_n", "depth_m")}
     assert any("taken not to drift" in note for note in fit_indentation(replace(test, **columns)).status)
+
+
+def part_of(test, kept, offset_n=0.0, delay_s=0.0):
+    columns = {name: getattr(test, name)[kept] for name in ("time_s", "force_n", "depth_m")}
+    columns["force_n"] = columns["force_n"] + offset_n
+    return replace(test, **{**columns, "time_s": columns["time_s"] + delay_s})
+
+
+def test_air_at_the_end_alone_shows_the_zero_of_the_force():
+    test = relaxation(STANDARD, np.random.default_rng(1))
+    from_touch = test.time_s >= -0.002
+    fits = [fit_indentation(part_of(test, from_touch, offset_n)) for offset_n in (0.0, 1e-3)]
+    assert not any("no force in air" in note for note in fits[1].status)
+    assert abs(fits[1].prony.moduli_pa / fits[0].prony.moduli_pa - 1).max() < 1e-3
+
+
+def test_a_zero_of_the_force_that_nothing_shows_is_said_to_be_taken_as_exact():
+    test = relaxation(STANDARD, np.random.default_rng(1))
+    pressed = (test.time_s >= -0.002) & (test.time_s < 30.0)
+    assert any("no force in air" in note for note in fit_indentation(part_of(test, pressed)).status)
+    stated = replace(part_of(test, pressed), force_std_n=1e-4)
+    assert not any("no force in air" in note for note in fit_indentation(stated).status)
+
+
+def test_a_drift_that_is_not_shown_is_left_out_whatever_the_clock_says():
+    """Also where the zero of the clock is the end of the hold."""
+    test = relaxation(STANDARD, np.random.default_rng(1), hold_s=10.0)
+    held = test.time_s < 10.0
+    end_s = means_of(part_of(test, held)).end_s
+    found = [
+        fit_indentation(part_of(test, held, delay_s=delay_s)).equilibrium_pa
+        for delay_s in (0.0, -end_s, 1e6)
+    ]
+    assert np.ptp(found) < 1e-3 * found[0]
 
 
 @pytest.mark.parametrize("rate_hz", [200.0, 500.0])
