@@ -32,7 +32,7 @@ class ContactAnalysis:
     contact : TissueContact
     moduli : Moduli
     black_box : Analysis or None
-        Where the record contradicts the calibration, and allows it.
+        Where the record contradicts the calibration or the fit does not converge, and the record allows it.
     warnings : tuple of str
     """
 
@@ -154,10 +154,13 @@ def estimate_contact(
     black_box = None
     if contact.poles.message:
         warnings.append(f"contact: {contact.poles.message}")
-    if contact.status is ContactStatus.CONTRADICTED:
+    if contact.status is not ContactStatus.OK:
+        why = "which the record contradicts"
+        if contact.status is ContactStatus.NOT_CONVERGED:
+            why = "through which the fit does not converge"
         try:
             black_box = analyse(recording, band_hz=band_hz)
-            warnings.append("poles without the calibration, which the record contradicts")
+            warnings.append(f"poles without the calibration, {why}")
         except ValueError as error:
             warnings.append(f"no poles without the calibration either: {error}")
     found = moduli(contact, ratio)

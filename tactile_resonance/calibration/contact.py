@@ -210,7 +210,8 @@ class Moduli:
     radius_ratio : float
         Over the ball's. All six are NaN where there is no radius, or one above the ball's.
     status : ContactStatus
-        OK, BEYOND_HERTZ where the radius is too large for Hertz's law, NO_FORCE where there is no radius.
+        OK, BEYOND_HERTZ where the radius is too large for Hertz's law, NO_FORCE where there is no radius, else
+        that of the contact.
     message : str
     """
 
@@ -265,8 +266,10 @@ def moduli(estimate: TissueContact, relaxed_ratio: float = 1.0) -> Moduli:
     if not ratio <= 1:
         why = f"contact radius {ratio:.3g} of the ball's, which no ball has, hence no modulus"
         return Moduli(ContactStatus.BEYOND_HERTZ, why)
-    status, message = ContactStatus.OK, ""
-    if not ratio <= STRICT_HERTZ:
+    status, message = estimate.status, ""
+    if status is not ContactStatus.OK:
+        message = f"of a stiffness that is itself no result: {status.value}"
+    elif not ratio <= STRICT_HERTZ:
         status = ContactStatus.BEYOND_HERTZ
         message = f"contact radius {ratio:.2f} of the ball's, strict Hertz reaches {STRICT_HERTZ:g}"
     (storage, loss), (storage_std, loss_std) = found.tolist(), std.tolist()

@@ -48,7 +48,7 @@ FEWEST_BETWEEN = 30
 LOUDEST = 9.0
 """Of the noise of the calibration, as power: what is more than that between lines is a transient that does not
 fit, as of another sensor, and must not widen the deviations until nothing contradicts the calibration."""
-_STEPS = 60
+_STEPS = 300
 _ENOUGH = 1e-3  # of the weighted squares: a thirtieth of a deviation
 _NEAR = (0.2, 5.0)
 """Of the ends of the band: poles between them have a state of their own where that at the start is unknown."""
@@ -152,6 +152,8 @@ class CalibratedEstimator:
         known, accepted = self.calibration.knows_tip(), "one with a mass or spring at the tip"
         require(known, "calibration", self.calibration.message, accepted)
         require(self.tip_radius_m > 0, "tip_radius_m", self.tip_radius_m, "above 0")
+        noise = self.calibration.noise_v_per_root_hz
+        require(0 < noise < np.inf, "noise_v_per_root_hz", noise, "of a calibration, a number above 0")
 
     def __call__(
         self,
@@ -172,14 +174,21 @@ class CalibratedEstimator:
         low, high = record.frequency_hz[0], record.frequency_hz[-1]
         air_hz = float(f[np.argmin(np.maximum(0, np.maximum(low - f, f - high)))])
         prior = ContactPrior(self.law, self.tip_radius_m, air_hz, force_n, force_std_n)
-        fit = _Fit(self.calibration, record, prior)
-        p, converged = fit.solved(prior.start)
-        if not converged:  # residuals on the way would contradict any calibration
-            again = _Fit(self.calibration, record, prior)
-            further = again.solved(prior.further_start)
-            if further[1]:
-                return again.result(*further)
-        return fit.result(p, converged)
+        found: list[TissueContact] = []
+        ran_away = np.linalg.LinAlgError()
+        for start in (prior.start, prior.further_start):
+            fit = _Fit(self.calibration, record, prior)
+            try:
+                found.append(fit.result(*fit.solved(start)))
+            except np.linalg.LinAlgError as error:
+                ran_away = error
+                continue
+            if found[-1].status is ContactStatus.OK:
+                return found[-1]
+        if not found:
+            raise ran_away
+        # residuals on the way would contradict any calibration
+        return min(found, key=lambda each: each.status is ContactStatus.NOT_CONVERGED)
 
 
 class _Fit:
@@ -340,7 +349,10 @@ class _Fit:
         squares = float(residual @ residual)
         dof = residual.size - p.size - self.directions
         status, of_poles, message = ContactStatus.OK, PolesStatus.OK, ""
-        if special.chdtrc(dof, squares) < CONTRADICTED:
+        if not converged:
+            status, of_poles = ContactStatus.NOT_CONVERGED, PolesStatus.NOT_CONVERGED
+            message = f"not converged in {_STEPS} steps"
+        elif special.chdtrc(dof, squares) < CONTRADICTED:
             status, of_poles = ContactStatus.CONTRADICTED, PolesStatus.MODEL_ERROR
             worst = int(np.argmax(np.abs(residual[-3:])))
             message = (
@@ -349,9 +361,6 @@ class _Fit:
             )
             if abs(residual[-3 + worst]) > 4:
                 message += f"; {self.prior.expected[worst]} beyond what any tissue has"
-        elif not converged:
-            status, of_poles = ContactStatus.NOT_CONVERGED, PolesStatus.NOT_CONVERGED
-            message = f"not converged in {_STEPS} steps"
         at = np.array([complex(value[0], value[1])])
         f0_hz, damping = natural_frequency_and_damping(at)
         turn = natural_frequency_and_damping_jacobian(at)[0]

@@ -16,7 +16,7 @@ from tactile_resonance.calibration.contact import (
     moduli,
 )
 from tactile_resonance.calibration.estimator import CalibratedEstimator, ContactRecord
-from tactile_resonance.calibration.model import SensorModel
+from tactile_resonance.calibration.model import Calibration, SensorModel
 from tactile_resonance.poles.result import PolesStatus, natural_frequency_and_damping
 
 LIBRARY = ("gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver", "tumour")
@@ -269,3 +269,54 @@ def test_a_sensor_of_unknown_tip_is_refused(given, bench):
     determined[3 * n : 4 * n] = False
     with pytest.raises(ValueError, match="mass or spring"):
         CalibratedEstimator(replace(given, determined=determined), bench.sensor.tip.radius_m)
+
+
+@pytest.mark.parametrize("noise", [np.nan, 0.0])
+def test_a_calibration_of_unknown_noise_is_refused(given, bench, noise):
+    unknown = replace(given, noise_v_per_root_hz=noise)
+    with pytest.raises(ValueError, match="noise_v_per_root_hz: got .*; accepted is of a calibration"):
+        CalibratedEstimator(unknown, bench.sensor.tip.radius_m)
+
+
+def test_moduli_of_a_contact_that_is_no_result_are_none_either(known, bench, library):
+    found = known(played(bench, contact_of(bench, library["gel16"]), seed=2, skew_s=SKEW_S), FORCE_N)
+    assert moduli(found).status is ContactStatus.OK
+    for status in (ContactStatus.CONTRADICTED, ContactStatus.NOT_CONVERGED):
+        of = moduli(replace(found, status=status))
+        assert of.status is status
+        assert status.value in of.message
+
+
+@pytest.mark.parametrize(
+    "law",  # of log modulus, rise, log time, log radius: what is expected, and up to 1.5 deviations off it
+    [[8.85, -2.31, -8.6, -6.61], [8.4, 0.61, -8.27, -6.39]],
+)
+def test_a_long_way_to_the_contact_contradicts_no_calibration(law):
+    """Little noise, exactly of sensor and law: what the fit leaves on its way says nothing."""
+    rate_hz, noise_v, band_hz = 5e3, 5e-4, (200.0, 300.0)
+    values = [236, 1540, 0.012, 0.012, 48.9, 170.7, 60.9, 46.4, 0.02, 3.5, 1.0, 0.0]
+    model = SensorModel.of_values(values)
+    density = noise_v * np.sqrt(2 / rate_hz)
+    exact = Calibration(model, np.zeros((12, 12)), np.ones(12, bool), (10, 1e3), density, 1.0)
+    signal = tr.design_multisine(
+        sample_rate_hz=rate_hz, samples_per_period=2000, band_hz=band_hz, seed=1
+    )
+    prior = ContactPrior(Law.STANDARD_LINEAR_SOLID, 2.5e-3, 236.0, FORCE_N)
+    contact, s = prior.stiffness(np.array(law)), 2j * np.pi * signal.frequency_hz
+    u, y = np.tile(signal.period(), (4, 1)), np.zeros(1001, complex)
+    y[signal.harmonics] = model.response(s, contact.at(s))
+    y = np.fft.irfft(y * np.fft.rfft(u), 2000)
+    record = ContactRecord.of_samples(
+        u,
+        y + noise_v * np.random.default_rng(22).standard_normal(y.shape),
+        sample_rate_hz=rate_hz,
+        harmonics=signal.harmonics,
+        band_hz=band_hz,
+        from_rest=False,
+    )
+    found = CalibratedEstimator(exact, 2.5e-3)(record, FORCE_N)
+    assert found.status is ContactStatus.OK, found.poles.message
+    k = complex(contact.at(np.array([2j * np.pi * found.poles.f0_hz[0]]))[0])
+    off = found.stiffness_n_per_m - k
+    std = np.sqrt(np.diag(found.stiffness_covariance))
+    assert max(abs(off.real) / std[0], abs(off.imag) / std[1]) < 4.5
