@@ -138,6 +138,40 @@ def test_a_constant_mode_does_not_change(periods):
         assert poles.message == "" or "two residual terms more" in poles.message
 
 
+def from_rest(periods, f0_drift_hz_per_s, damping, noise=2e-3, runs=12):
+    u, y = record(periods, f0_drift_hz_per_s, 0.0, damping)
+    rng = np.random.default_rng(2)
+    for _ in range(runs):
+        yield identify_poles_from_records(
+            u + noise / 10 * rng.standard_normal(u.shape),
+            y + noise * rng.standard_normal(y.shape),
+            sample_rate_hz=RATE_HZ,
+            harmonics=HARMONICS,
+            band_hz=(200.0, 300.0),
+            structure=BARE,
+        )
+
+
+@pytest.mark.parametrize(("drift", "damping"), [(3.0, 0.02), (1.0, 0.01), (0.3, 0.005)])
+def test_what_decays_from_the_start_has_the_changing_pole_of_the_start(drift, damping):
+    """The mean over runs is that of a constant mode, to half a deviation of one."""
+    found = list(from_rest(2, drift, damping))
+    constant = [p.main.estimate for p in from_rest(2, 0.0, damping)]
+    assert all(p.status is PolesStatus.OK for p in found)
+    off = [(p.main.estimate - np.mean(constant, axis=0)) / p.main.std for p in found]
+    assert np.all(np.abs(np.mean(off, axis=0)) < 0.6)
+    rates = [(p.f0_drift_hz_per_s[0] - drift) / np.sqrt(p.drift_covariance[0, 0, 0]) for p in found]
+    assert abs(np.mean(rates)) < 1
+
+
+@pytest.mark.parametrize(("periods", "damping"), [(2, 0.002), (4, 0.002)])
+def test_a_mode_too_narrow_for_its_drift_is_a_model_error(periods, damping):
+    """Means are off by three to five of their deviations there."""
+    for poles in from_rest(periods, 0.3, damping, runs=4):
+        assert poles.status is PolesStatus.MODEL_ERROR
+        assert "too narrow for such a drift" in poles.message
+
+
 def test_without_noise_rounding_is_no_change():
     u, y = record(3, 0.0, 0.0)
     poles = identify_poles_from_records(
