@@ -128,7 +128,7 @@ class Means:
     Attributes
     ----------
     time_s, depth_m, force_n, std_n : (N,) arrays
-        Of the contact; std_n from the noise of the forces alone.
+        Of the contact; std_n from the noise of the forces and their last digit.
     turn : int
         Last of them before the tip is drawn back.
     free_time_s, free_force_n, free_std_n : (M,) arrays
@@ -211,7 +211,8 @@ def means_of(test: IndentationRecord) -> Means:
         edges += _even(time, last + 1, clear, RAMP_PARTS)
     taken = np.asarray(edges)
     time_s, depth_m, force_n = (_mean(v, taken) for v in (time, depth, force))
-    std = noise / np.sqrt(np.diff(taken))
+    rounding = _rounding_of(test, noise)
+    std = np.hypot(noise / np.sqrt(np.diff(taken)), rounding)
     ends = [0, *_even(time, 0, first, BEFORE_PARTS)] if first > BEFORE_PARTS else []
     before = np.asarray(ends, int)
     after = np.asarray([], int)
@@ -229,7 +230,7 @@ def means_of(test: IndentationRecord) -> Means:
         turn,
         free_s,
         free_n,
-        noise / np.sqrt(counts),
+        np.hypot(noise / np.sqrt(counts), rounding),
         float(time[first]),
         float(time[ramp] - time[first]),
         float(time[last]),
@@ -249,7 +250,8 @@ LARGEST = 3.5
 def _noise_of(test: IndentationRecord) -> float:
     """Standard deviation of one force: what neighbours differ by (von Neumann 1941).
 
-    Of means over some samples, where there are many: those of a filter are alike.
+    Of means over some samples, where there are many: those of a filter are alike. Not less than the rounding of
+    the last digit, below which neighbours are equal.
     """
     noise, force = test.noise_n, test.force_n
     if np.isnan(noise):
@@ -257,6 +259,14 @@ def _noise_of(test: IndentationRecord) -> float:
         means = force[: force.size // count * count].reshape(-1, count).mean(1)
         noise = float(np.sqrt(count * np.median(np.diff(means) ** 2) / 2 / MEDIAN_OF_SQUARE))
     return max(noise, 1e-9 * float(np.abs(test.force_n).max()))
+
+
+def _rounding_of(test: IndentationRecord, noise: float) -> float:
+    """Standard deviation of the rounding of the last digit where noise is less: no mean averages it."""
+    steps = np.diff(np.unique(test.force_n))
+    steps = steps[steps > 1e-9 * np.abs(test.force_n).max()]
+    digit = float(steps.min(initial=np.inf))
+    return digit / math.sqrt(12) if noise < digit / 2 < math.inf else 0.0
 
 
 def _mean(values: FloatArray, edges: IntArray) -> FloatArray:

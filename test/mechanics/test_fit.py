@@ -214,6 +214,20 @@ def test_means_of_a_hold_do_not_begin_to_draw_back_before_it_ends(rate_hz):
     assert abs(np.log(fit.modulus(5.0)[0] / truth.relaxation_modulus(5.0))) < 1e-3
 
 
+@pytest.mark.parametrize("digit_n", [1e-3, 5e-4])
+def test_the_last_digit_of_the_forces_is_an_error_that_no_mean_averages(digit_n):
+    """Of forces whose noise is a tenth of it: neighbours are equal, and say nothing of noise."""
+    pooled = []
+    for seed in range(8):
+        test = relaxation(STANDARD, np.random.default_rng(seed), noise_n=5e-5)
+        rounded = replace(test, force_n=digit_n * np.round(test.force_n / digit_n))
+        fit = fit_indentation(rounded, most_terms=2)
+        assert fit.chi_square / fit.dof < 2
+        pooled += deviations(fit, STANDARD)
+    assert np.abs(pooled).max() < 4
+    assert np.mean(np.abs(pooled) < 1.96) > 0.8
+
+
 @pytest.mark.parametrize("thickness_m", [0.0, -1e-3, np.inf])
 def test_a_thickness_is_above_zero(thickness_m):
     test = relaxation(STANDARD, np.random.default_rng(1), hold_s=3.0)
