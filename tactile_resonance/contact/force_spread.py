@@ -152,7 +152,8 @@ class ForceOver:
     force_std_n : float
         Standard deviation of that mean [N]: that of the zero, and from the means of eight batches, so that
         correlated noise and a slow decay count as they should (method of batch means; Law, *Simulation
-        Modeling and Analysis*, section 9.5.3). NaN for fewer than 32 wrenches.
+        Modeling and Analysis*, section 9.5.3). Noise that is alike over a batch or longer passes for motion of
+        the force, which is no error of its mean. NaN for fewer than 32 wrenches.
     spread : ForceSpread
         How the force moved meanwhile.
     coverage : float
