@@ -48,7 +48,7 @@ POISSON_RATIO = 0.49
 SLIP = 2 * (1 - POISSON_RATIO) / (2 - POISSON_RATIO)
 """Tangential over normal stiffness of the contact before it slips (Mindlin 1949)."""
 
-NOTHING = Payload(0.0, ORIGIN)
+_NOTHING = Payload(0.0, ORIGIN)
 
 
 class Plant:
@@ -106,7 +106,7 @@ class Plant:
         *,
         tip_radius_m: float,
         mount: Mount = Mount.TABLE,
-        carried: Payload = NOTHING,
+        carried: Payload = _NOTHING,
         friction: float = 0.1,
     ) -> None:
         require(0 < tip_radius_m < math.inf, "tip_radius_m", tip_radius_m, "a number above 0")

@@ -33,7 +33,7 @@ NODE_SPACING = 1e-3  # of the profile, in tip radii; the error of unloading goes
 MAX_NODES_PER_STEP = 64
 NODES = 1024
 """Of the profile, for which there is room at first."""
-AT_ONCE = 8
+SUBSTEPS_AT_ONCE = 8
 """Sub-steps of a swing for which there is room at a time."""
 
 STATE = np.dtype(
@@ -474,8 +474,8 @@ class Indenter:
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
         """Move at the end of a beam for `count` times `h_s`, as the function `swing`; return its motion."""
-        for first in range(0, count, AT_ONCE):
-            end = min(first + AT_ONCE, count)
+        for first in range(0, count, SUBSTEPS_AT_ONCE):
+            end = min(first + SUBSTEPS_AT_ONCE, count)
             self._make_room(end - first)
             *ball, self.force_n, self.contact_radius_m, self._count = _swing(
                 *(self._state, self._terms, *self._nodes, *self._free),

@@ -9,11 +9,11 @@ from typing import Any
 
 from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
 from tactile_resonance.simulation.ur5e import motion
+from tactile_resonance.simulation.ur5e.command_loop import Command, CommandLoop
 from tactile_resonance.simulation.ur5e.forces import ForceTask, ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture
 from tactile_resonance.simulation.ur5e.machine import Machine
 from tactile_resonance.simulation.ur5e.poses import Six, pose_from_transform, product
-from tactile_resonance.simulation.ur5e.program import Command, CommandLoop
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError, Thread
 from tactile_resonance.simulation.ur5e.variables import Registers
 

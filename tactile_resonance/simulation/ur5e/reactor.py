@@ -129,7 +129,7 @@ class Connection:
         late = self in self._reactor.unsent
         if not self.is_open or (droppable and (late or self.frozen)):
             return False
-        if len(self._unsent) > self._most_unsent:
+        if late and len(self._unsent) > self._most_unsent:
             self.close()
             return False
         self._unsent += data
@@ -207,7 +207,7 @@ class Reactor:
     frozen : bool
         Nothing passes the freezable ports.
     unsent : set of Connection
-        Those whose network does not take all data at once.
+        Those whose network does not take all data at once, or passes none.
     gathered : set of Connection
         Those for which data wait to be sent together.
     """
