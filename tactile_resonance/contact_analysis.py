@@ -32,7 +32,8 @@ class ContactAnalysis:
     contact : TissueContact
     moduli : Moduli
     black_box : Analysis or None
-        Where the record contradicts the calibration or the fit does not converge, and the record allows it.
+        Where the record contradicts the calibration, nothing is touched or the fit does not converge, and the
+        record allows it.
     warnings : tuple of str
     """
 
@@ -158,6 +159,8 @@ def estimate_contact(
         why = "which the record contradicts"
         if contact.status is ContactStatus.NOT_CONVERGED:
             why = "through which the fit does not converge"
+        elif contact.status is ContactStatus.NO_CONTACT:
+            why = "since nothing is touched"
         try:
             black_box = analyse(recording, band_hz=band_hz)
             warnings.append(f"poles without the calibration, {why}")

@@ -163,6 +163,7 @@ class ContactStatus(str, Enum):
     OK = "ok"
     CONTRADICTED = "contradicts the calibration"
     NOT_CONVERGED = "not converged"
+    NO_CONTACT = "nothing is touched"
     BEYOND_HERTZ = "beyond strict Hertz"
     NO_FORCE = "no force"
 
@@ -241,6 +242,8 @@ def moduli(estimate: TissueContact, relaxed_ratio: float = 1.0) -> Moduli:
     ``E' = (1 - nu^2) sqrt(k'^3 / (6 F R ratio))``.
     """
     prior, radius_of_tip = estimate.prior, estimate.prior.tip_radius_m
+    if estimate.status is ContactStatus.NO_CONTACT:
+        return Moduli(estimate.status, "nothing is touched, hence no modulus")
     if not np.isfinite(prior.force_n):
         why = "no force, hence no contact radius and no modulus"
         return Moduli(ContactStatus.NO_FORCE, why)

@@ -352,6 +352,9 @@ class _Fit:
         if not converged:
             status, of_poles = ContactStatus.NOT_CONVERGED, PolesStatus.NOT_CONVERGED
             message = f"not converged in {_STEPS} steps"
+        elif (size := abs(complex(value[2], value[3]))) < IN_AIR_N_PER_M:
+            status, of_poles = ContactStatus.NO_CONTACT, PolesStatus.MODEL_ERROR
+            message = f"nothing is touched: {size:.2g} N/m, tissue has more than {IN_AIR_N_PER_M:g}"
         elif special.chdtrc(dof, squares) < CONTRADICTED:
             status, of_poles = ContactStatus.CONTRADICTED, PolesStatus.MODEL_ERROR
             worst = int(np.argmax(np.abs(residual[-3:])))

@@ -10,7 +10,7 @@ from calibration.played import contact_of, run_on
 
 import tactile_resonance as tr
 from benchmarks.calibrate_benches import BAND_HZ, excitation
-from tactile_resonance.calibration.contact import Law
+from tactile_resonance.calibration.contact import ContactStatus, Law
 from tactile_resonance.calibration.model import CalibratedSensor
 from tactile_resonance.cli import main
 from tactile_resonance.simulation.sensor.bimorph import couple
@@ -66,6 +66,23 @@ def test_one_period_needs_a_known_start(bench, library, sensor_file):
             tr.estimate_contact(recording, sensor_file, **known, force_n=FORCE_N, force_std_n=std)
     by_name = tr.estimate_contact(recording, sensor_file, **known, law="power law")
     assert by_name.contact.prior.law is Law.POWER_LAW
+
+
+def test_a_record_in_air_is_no_contact_and_contradicts_nothing(bench, sensor_file):
+    recording = recording_on(bench, None, 0.1, 6)
+    found = tr.estimate_contact(recording, sensor_file, band_hz=BAND_HZ, force_n=FORCE_N)
+    assert found.contact.status is found.moduli.status is ContactStatus.NO_CONTACT
+    assert np.isnan(found.moduli.storage_pa)
+    assert any("nothing is touched" in text for text in found.warnings)
+    assert not any("contradict" in text for text in found.warnings)
+    assert found.poles is found.black_box.poles
+
+
+@pytest.mark.parametrize("force_std_n", [np.nan, -1e-3, np.inf])
+def test_the_deviation_of_a_force_is_a_number(bench, library, sensor_file, force_std_n):
+    recording = recording_on(bench, contact_of(bench, library["gel16"]), 0.1, 6)
+    with pytest.raises(ValueError, match="force_std_n: got .*; accepted is"):
+        tr.estimate_contact(recording, sensor_file, force_n=FORCE_N, force_std_n=force_std_n)
 
 
 def test_a_contradicted_calibration_falls_back_and_says_so(bench, library, sensor_file):
