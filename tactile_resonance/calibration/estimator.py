@@ -49,6 +49,9 @@ LOUDEST = 9.0
 """Of the noise of the calibration, as power: what is more than that between lines is a transient that does not
 fit, as of another sensor, and must not widen the deviations until nothing contradicts the calibration."""
 _STEPS = 300
+_LONGEST = 0.2
+"""Of a step in any parameter, logarithms and an exponent: first steps overshoot, and a power law that leaves
+its exponents stays there."""
 _ENOUGH = 1e-3  # of the weighted squares: a thirtieth of a deviation
 _NEAR = (0.2, 5.0)
 """Of the ends of the band: poles between them have a state of their own where that at the start is unknown."""
@@ -301,7 +304,7 @@ class _Fit:
             normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
             while damping < 1e9:
                 step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
-                step *= min(1.0, 1.0 / np.abs(step).max())
+                step *= min(1.0, _LONGEST / np.abs(step).max())
                 tried = self.residual(p + step)
                 if tried @ tried <= cost:
                     break

@@ -288,12 +288,18 @@ def test_moduli_of_a_contact_that_is_no_result_are_none_either(known, bench, lib
 
 
 @pytest.mark.parametrize(
-    "law",  # of log modulus, rise, log time, log radius: what is expected, and up to 1.5 deviations off it
-    [[8.85, -2.31, -8.6, -6.61], [8.4, 0.61, -8.27, -6.39]],
+    ("law", "noise_v", "parameters"),  # what is expected, and up to 1.5 deviations off it
+    [
+        (Law.STANDARD_LINEAR_SOLID, 5e-4, [8.85, -2.31, -8.6, -6.61]),
+        (Law.STANDARD_LINEAR_SOLID, 5e-4, [8.4, 0.61, -8.27, -6.39]),
+        (Law.POWER_LAW, 5e-3, [10.43, 0.02, -7.52, -0.79]),
+        (Law.POWER_LAW, 5e-3, [10.34, 0.02, -6.93, -0.12]),
+        (Law.POWER_LAW, 5e-3, [8.15, 0.43, -6.16, -0.01]),
+    ],
 )
-def test_a_long_way_to_the_contact_contradicts_no_calibration(law):
+def test_a_long_way_to_the_contact_contradicts_no_calibration(law, noise_v, parameters):
     """Little noise, exactly of sensor and law: what the fit leaves on its way says nothing."""
-    rate_hz, noise_v, band_hz = 5e3, 5e-4, (200.0, 300.0)
+    rate_hz, band_hz = 5e3, (200.0, 300.0)
     values = [236, 1540, 0.012, 0.012, 48.9, 170.7, 60.9, 46.4, 0.02, 3.5, 1.0, 0.0]
     model = SensorModel.of_values(values)
     density = noise_v * np.sqrt(2 / rate_hz)
@@ -301,8 +307,8 @@ def test_a_long_way_to_the_contact_contradicts_no_calibration(law):
     signal = tr.design_multisine(
         sample_rate_hz=rate_hz, samples_per_period=2000, band_hz=band_hz, seed=1
     )
-    prior = ContactPrior(Law.STANDARD_LINEAR_SOLID, 2.5e-3, 236.0, FORCE_N)
-    contact, s = prior.stiffness(np.array(law)), 2j * np.pi * signal.frequency_hz
+    prior = ContactPrior(law, 2.5e-3, 236.0, FORCE_N)
+    contact, s = prior.stiffness(np.array(parameters)), 2j * np.pi * signal.frequency_hz
     u, y = np.tile(signal.period(), (4, 1)), np.zeros(1001, complex)
     y[signal.harmonics] = model.response(s, contact.at(s))
     y = np.fft.irfft(y * np.fft.rfft(u), 2000)
@@ -314,7 +320,7 @@ def test_a_long_way_to_the_contact_contradicts_no_calibration(law):
         band_hz=band_hz,
         from_rest=False,
     )
-    found = CalibratedEstimator(exact, 2.5e-3)(record, FORCE_N)
+    found = CalibratedEstimator(exact, 2.5e-3, law)(record, FORCE_N)
     assert found.status is ContactStatus.OK, found.poles.message
     k = complex(contact.at(np.array([2j * np.pi * found.poles.f0_hz[0]]))[0])
     off = found.stiffness_n_per_m - k
