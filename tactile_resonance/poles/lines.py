@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.frf.result import FRF
@@ -26,7 +27,7 @@ from tactile_resonance.poles.fit import (
 )
 from tactile_resonance.poles.likelihood import Rules, Solution
 from tactile_resonance.poles.model import RationalModel
-from tactile_resonance.poles.noise_level import VarianceModel, model_variance
+from tactile_resonance.poles.noise_level import FALSE_ALARM, VarianceModel, model_variance
 from tactile_resonance.poles.starts import (
     SEVERAL_MODES,
     best_of_split,
@@ -136,10 +137,13 @@ def lines_of_spectra(
         dof=dof if dof > 0 else EXACT,
         kind=np.maximum(model_y.kind, model_u.kind),
     )
-    together = known.kind[:, None] < 2
     smooth_y, smooth_u = (np.where(usable, m.variance, 0.0) for m in (model_y, model_u))
     both = np.sqrt(smooth_y * smooth_u)
-    correlation = (c_yu / _or_one(both)).sum(axis=-1, keepdims=True)
+    of_line = np.asarray(c_yu / _or_one(both), complex)
+    correlation = of_line.sum(axis=-1, keepdims=True)
+    varies = _varies(of_line, correlation, usable, dof)
+    known = replace(known, kind=np.where(varies, 2, known.kind))
+    together = known.kind[:, None] < 2
     correlation /= np.maximum(known.lines[:, None], np.abs(correlation))  # 1 at most
     c_yu = np.where(together, correlation * both, c_yu)
     c_yy, c_uu = (np.where(together, *pair) for pair in ((smooth_y, c_yy), (smooth_u, c_uu)))
@@ -169,6 +173,21 @@ def _channel(variance: FloatArray, usable: BoolArray, dof: int, pooled: bool) ->
     # a channel without noise is as flat as any
     noisy = np.asarray((variance > 0).any(axis=-1))[:, None]
     return replace(model, variance=np.where(noisy, model.variance, 0.0))
+
+
+def _varies(of_line: ComplexArray, total: ComplexArray, usable: BoolArray, dof: int) -> BoolArray:
+    """(batch,) whether sample correlations (batch, F) scatter about their mean by more than chance allows.
+
+    `total` (batch, 1) is their sum. Of `dof` degrees of freedom they scatter by 1 / dof each, whatever the
+    correlation; the square of that has a relative variance of 2 + 6 / dof at most, where the channels are one.
+    """
+    lines = usable.sum(axis=-1)
+    if dof <= 0:
+        return np.zeros(lines.shape, bool)
+    apart = np.where(usable, of_line - total / np.maximum(lines, 1)[:, None], 0.0)
+    scatter = dof * np.sum(apart.real**2 + apart.imag**2, axis=-1) / np.maximum(lines - 1, 1)
+    shape = np.maximum(lines - 1, 1) / (2 + 6 / dof)
+    return np.asarray(scatter > special.gammainccinv(shape, FALSE_ALARM) / shape)
 
 
 def _power(values: ComplexArray, usable: BoolArray) -> FloatArray:

@@ -70,6 +70,26 @@ def test_correlated_noise_of_both_channels(turn):
     assert result.has_status(PolesStatus.OK).mean() > 0.98
 
 
+@pytest.mark.parametrize("dof", [3, 7])
+def test_a_correlation_that_turns_over_the_band_is_not_taken_from_all_of_it(dof):
+    """Variances are flat; the mean of the correlation, about 0, would make ellipses a third too small."""
+    rng = np.random.default_rng(8)
+    turn = 0.9j * np.exp(2j * np.pi * (LINES_HZ - 250) / 100)
+
+    def noise(*shape):
+        u, own = circular(rng, (*shape, 41), 1e-4), circular(rng, (*shape, 41), 1e-4)
+        return np.stack([turn * u + np.sqrt(0.19) * own, u], axis=-2)
+
+    samples = noise(dof, RUNS)
+    covariance = np.einsum("krif,krjf->rijf", samples, samples.conj()) / dof
+    z = np.stack([G, np.ones(41)]) + noise(RUNS)
+    result = identify_spectra(LINES_HZ, z, covariance, dof)
+    assert (result.variance_model == "per line").all()
+    inside = RUNS * judge(errors_of(result), result.covariance[:, 0], np.eye(2))[1]
+    assert stats.binom.cdf(inside, RUNS, 0.94) > 0.0005
+    assert result.has_status(PolesStatus.OK).mean() > 0.98
+
+
 def test_level_from_the_residuals_of_few_lines_is_not_too_small():
     """Five parameters take 2.5 of nine complex residuals: ignored, the level is 28 % low.
 
