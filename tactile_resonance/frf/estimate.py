@@ -33,6 +33,9 @@ FALSE_ALARM = 1e-4
 WEAK_INPUT_DB = 10.0
 """Input signal-to-noise ratio of a mean spectrum below which Y/U is biased [dB]."""
 
+LEVELS_ALIKE = 0.1
+"""Relative powers of realisations that differ by less are those of one level."""
+
 # Lines above the so-many-th largest count alike: a tone is large on one.
 LINES_ALIKE = 5
 # Resonators that are slightly nonlinear differ by less.
@@ -115,8 +118,9 @@ def frf_of_realisations(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> F
     The noise variance is that of the mean noise covariance over realisations, at the mean G, over
     the mean input power, ``(C_YY + |G|^2 C_UU - 2 Re(C_YU conj G)) / (M^2 mean |U|^2)``, sums over
     m understood: to first order in the noise. The total variance is the sample variance over realisations.
-    Random phases and equal amplitude spectra of all realisations are presumed. `total_dof` is M - 1: the
-    total variance of few realisations is itself uncertain.
+    Random phases are presumed, and amplitude spectra that are equal but for their level. Where levels differ,
+    C and U of each are those of the mean level, and `noise_dof` is that of the sum (Satterthwaite): the weakest
+    hold most of the variance. `total_dof` is M - 1: the total variance of few realisations is itself uncertain.
 
     With noise on the input the ratio is biased and its variance formula too small where the mean
     input is not well above its noise: the relative bias is ``-exp(-|U|^2 / var U)`` for
@@ -139,10 +143,11 @@ def frf_of_realisations(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> F
     g = g_each.mean(axis=-2)
     variance_total = np.var(g_each, axis=-2, ddof=1) / realisations if several else None
     variance_noise = given = differ = None
+    weight = _of_level(input_power)
     if spectra.covariance is not None:
-        noise = spectra.covariance.mean(axis=-4) / realisations  # (..., 2, 2, F)
-        given = conditional_variance(noise)
-        variance_noise = error_variance(g, noise) / input_power.mean(axis=-2)
+        given = conditional_variance(spectra.covariance.mean(axis=-4) / realisations)
+        noise = (spectra.covariance * weight[:, None, None, None]).mean(axis=-4) / realisations
+        variance_noise = error_variance(g, noise) / (input_power * weight[:, None]).mean(axis=-2)
         if variance_total is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
                 differ = np.median(variance_total / variance_noise, axis=-1).reshape(-1)
@@ -157,7 +162,7 @@ def frf_of_realisations(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> F
         g=g,
         variance_noise=variance_noise,
         variance_total=variance_total,
-        noise_dof=realisations * spectra.noise_dof,
+        noise_dof=round(weight.sum() ** 2 / (weight @ weight) * spectra.noise_dof),
         total_dof=realisations - 1,
         actuator_amplitude=None if several else np.abs(each[..., 0, 1, :]),
         sensor_variance_given_actuator=given,
@@ -167,6 +172,13 @@ def frf_of_realisations(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> F
         status=status,
         message=message,
     )
+
+
+def _of_level(input_power: FloatArray) -> FloatArray:
+    """(M,) mean power over that of each realisation, of (..., M, F); 1 where they are alike."""
+    power_each = np.moveaxis(input_power, -2, 0).reshape(input_power.shape[-2], -1).mean(axis=-1)
+    weight = power_each.mean() / np.where(power_each > 0, power_each, np.inf)
+    return weight if np.all(weight > 0) and np.ptp(weight) > LEVELS_ALIKE else np.ones(weight.size)
 
 
 def _response_status(

@@ -45,6 +45,27 @@ def test_equals_the_reference_implementation(shared_data):
     assert (result.noise_dof, result.total_dof) == (4 * 3, 3)
 
 
+@pytest.mark.parametrize("levels", [(1.0, 0.1), (1.0, 1.0, 0.5, 0.1)])
+def test_noise_variance_of_realisations_of_unequal_level(multisine, levels):
+    """The weakest realisations hold most of the noise of the mean response."""
+    rng = np.random.default_rng(9)
+    runs, realisations, periods = 40, len(levels), 4
+    u = multisine(LINES, SAMPLES, rng, records=(runs, realisations)) * np.array(levels)[:, None]
+    u = np.tile(u, periods)
+    clean = np.stack([signal.lfilter(*SYSTEM, np.tile(u, 2))[..., -u.shape[-1] :], u])
+    noisy = clean + 0.01 * rng.standard_normal(clean.shape)
+    y, u = noisy.reshape(2, runs, realisations, periods, SAMPLES)
+    spectra = transient_free_spectra(Spectrum.of(u, y), LINES)
+    result = frf_of_realisations(spectra, sample_rate_hz=1.0)
+    truth = signal.freqz(*SYSTEM, 2 * np.pi * LINES / SAMPLES)[1]
+    assert spectra.noise_dof <= result.noise_dof <= 1.2 * spectra.noise_dof
+    squared = np.abs(result.g - truth) ** 2 / result.variance_noise
+    for probability in (0.68, 0.95):
+        inside = squared < stats.f.ppf(probability, 2, 2 * result.noise_dof)
+        error = np.sqrt(probability * (1 - probability) / runs / 10)  # variances of neighbours share bins
+        assert np.mean(inside) == pytest.approx(probability, abs=4 * error)
+
+
 def cubic_records(rng, multisine, runs, realisations, periods, noise):
     """[Y; U] of ``(u + 0.1 u^3)`` filtered, from rest: (2, runs, M, P, N)."""
     u = multisine(LINES, SAMPLES, rng, amplitude=0.2, records=(runs, realisations))
