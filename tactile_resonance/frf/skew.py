@@ -72,9 +72,11 @@ def skew_from_loopback(
             f"u, y: phase between the channels is {largest:.2f} rad off a straight line, expected "
             "a loop-back: both channels on the same signal"
         )
-    aligned = frf.g * np.exp(2j * np.pi * f * delay)
-    gain = float(np.mean(np.abs(aligned)) * np.sign(np.cos(intercept)))
-    return ChannelSkew(float(delay), float(std), gain, largest)
+    sign = np.sign(np.cos(intercept))
+    # the line need not pass through zero: what it has there no delay takes out
+    left = np.angle(correct_skew(frf, float(delay)).g * sign)
+    gain = float(np.mean(np.abs(frf.g)) * sign)
+    return ChannelSkew(float(delay), float(std), gain, float(np.max(np.abs(left))))
 
 
 def correct_skew(frf: FRF, delay_s: float) -> FRF:

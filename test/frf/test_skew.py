@@ -53,6 +53,24 @@ def test_delays_of_many_samples_need_no_unwrapping(multisine, delay_s):
     assert skew.delay_s == pytest.approx(delay_s, abs=6 * skew.delay_std_s)
 
 
+@pytest.mark.parametrize("gain", [1.0, -1.0])
+def test_a_phase_that_no_delay_takes_out_is_told(gain):
+    """One channel is coupled through a capacitor: far above its corner the phase is straight."""
+    lines = np.arange(20, 31)
+    f = F_HZ[lines]
+    response = gain * 1j * f / (1j * f + 10)
+    period = np.zeros(SAMPLES // 2 + 1, complex)
+    period[lines] = np.exp(1j * np.random.default_rng(4).uniform(0, 2 * np.pi, lines.size))
+    u = np.tile(np.fft.irfft(period), (2, 1))
+    period[lines] *= response
+    y = np.tile(np.fft.irfft(period), (2, 1))
+    skew = skew_from_loopback(u, y, sample_rate_hz=RATE, harmonics=lines)
+    left = np.angle(gain * response * np.exp(2j * np.pi * f * skew.delay_s))
+    assert skew.gain == pytest.approx(gain, rel=0.01)
+    assert skew.residual_rad == pytest.approx(np.max(np.abs(left)), rel=1e-6)
+    assert skew.residual_rad > 0.05
+
+
 def settled_frf(u, y):
     spectra = averaged_spectra(Spectrum.of(u[None], y[None]), LINES)
     return frf_of_realisations(spectra, sample_rate_hz=RATE)
