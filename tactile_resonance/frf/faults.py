@@ -253,15 +253,27 @@ def offset(x: _Channel) -> Fault | None:
 
 
 def drift(x: _Channel) -> Fault | None:
-    """Period means that wander. In a single period drift is not distinguished from its slowest lines."""
+    """Period means that wander by more than noise. In a single period drift looks like slow lines."""
     if x.periods < 2:
         return None
     means = x.samples.mean(axis=-1)
     spread = float(np.ptp(means))
-    if spread <= LARGE_DRIFT * float(np.std(x.samples - means[:, None])):
+    if spread <= LARGE_DRIFT * float(np.std(x.samples - means[:, None])) or spread <= _spread_of_noise(x):
         return None
     text = f"The mean of the {x.name} drifts by {spread:.3g} V over the record"
     return x.fault(FaultKind.DRIFT, spread, False, text)
+
+
+def _spread_of_noise(x: _Channel) -> float:
+    """What the means of periods of noise hardly differ by, from the bins between the lowest harmonics."""
+    at = np.arange(x.periods + 1, min(10 * x.periods, x.bins.size - 1))
+    at = at[at % x.periods != 0]
+    if at.size == 0:
+        return 0.0
+    # of white noise a mean has as much power as the bins of one period; their median bears a tone
+    variance = x.periods * np.median(np.abs(x.bins[at]) ** 2) / np.log(2)
+    pairs = x.periods * (x.periods - 1) / 2
+    return float(special.stdtrit(at.size, 1 - _FALSE_ALARM / (2 * pairs)) * np.sqrt(2 * variance))
 
 
 def hum(x: _Channel) -> Fault | None:

@@ -176,6 +176,19 @@ def test_offset_and_drift(record):
     assert not report.suspect
 
 
+def test_means_of_noise_over_short_periods_are_no_drift(multisine):
+    rng = np.random.default_rng(7)
+    harmonics = np.arange(40, 61)
+    u = multisine(harmonics, 400, rng, amplitude=0.1)
+    u = np.broadcast_to(u, (100, 6, 400))
+    y = u + u.std() * rng.standard_normal(u.shape)
+    ramp = u.std() * np.linspace(-0.5, 0.5, 6 * 400).reshape(6, 400)
+    for more, found in ((0, set()), (ramp, {FaultKind.DRIFT})):
+        for of in y + more:
+            record = Spectrum.of(u[0], of)
+            assert kinds(find_faults(record, sample_rate_hz=RATE, harmonics=harmonics)) == found
+
+
 # 50 Hz is an excited line, 60 Hz lies six bins from the next
 @pytest.mark.parametrize(("mains", "near"), [(50.013, True), (60.02, False)])
 def test_hum(record, mains, near):
