@@ -381,7 +381,8 @@ def _coherent(
     """(P - 1,) whether periods, shifted back, are more alike to the first than periods of noise.
 
     The coherence r^2 over F lines of noise exceeds c with the probability (1 - c)^(F - 1) at one shift, with
-    at most N times that at any of N (Carter, Knapp, Nuttall, IEEE Trans. Audio Electroacoust. 21, 1973, 337).
+    at most N times that at any of N (Carter, Knapp, Nuttall, IEEE Trans. Audio Electroacoust. 21, 1973, 337),
+    and P - 1 times that in any period.
     """
     level = np.sqrt(np.mean(np.abs(lines) ** 2, axis=0))  # (F,), of noise that is not white
     white = np.divide(lines, level, out=np.zeros_like(lines), where=level > 0)
@@ -389,7 +390,7 @@ def _coherent(
     power = np.sum(np.abs(white) ** 2, axis=-1)
     cross = np.abs(np.sum(white[1:] * back * white[0].conj(), axis=-1)) ** 2
     incoherent = 1 - cross / np.maximum(power[1:] * power[0], np.finfo(float).tiny)  # (P - 1,)
-    chance = (_FALSE_ALARM / samples) ** (1 / max(harmonics.size - 1, 1))
+    chance = (_FALSE_ALARM / (samples * shift.size)) ** (1 / max(harmonics.size - 1, 1))
     return np.asarray(incoherent < chance)
 
 
@@ -407,7 +408,8 @@ def clocks(x: _Channel) -> Fault | None:
     rest = np.sum(weight * (phase - slope * h) ** 2) / np.sum(weight) * h.size / (h.size - 1)
     std = np.sqrt(rest * np.sum((weight * h) ** 2)) / np.sum(weight * h**2)
     turned = abs(slope) * h[-1] * (x.periods - 1)  # over the record, of the highest line
-    if turned < LEAST_TURN or np.abs(phase).max() > 1 or abs(slope) < 6 * std:
+    least = max(6.0, -float(special.stdtrit(h.size - 1, _FALSE_ALARM / 2)))
+    if turned < LEAST_TURN or np.abs(phase).max() > 1 or abs(slope) < least * std:
         return None
     # samples lost between two periods shift these alone
     each = np.sum(cross.imag * h, axis=-1) / np.sum(np.abs(cross) * h**2, axis=-1)  # (P - 1,)

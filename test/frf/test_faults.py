@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Acquisition faults, each injected alone into a good record, and none seen in a good one."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from scipy import io, signal
+from scipy import io, signal, stats
 
 from tactile_resonance.frf.estimate import frf_of_record
-from tactile_resonance.frf.faults import FaultKind, FaultReport, find_faults
+from tactile_resonance.frf.faults import FaultKind, FaultReport, clocks, find_faults
 from tactile_resonance.frf.result import FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.multisine import design_multisine
@@ -164,6 +166,19 @@ def test_a_shift_between_two_periods_is_no_clock(lost):
         record = Spectrum.of(u + 1e-3 * rng.standard_normal(u.shape), u)
         report = find_faults(record, sample_rate_hz=5e3, harmonics=harmonics)
         assert FaultKind.CLOCKS not in kinds(report)
+
+
+def test_few_lines_of_noise_are_hardly_ever_of_different_clocks():
+    """The deviation of the slope is known from the phases of eight lines; six of it are no rarity then."""
+    rng = np.random.default_rng(12)
+    runs, harmonics = 15_000, np.arange(8)
+    noise = 0.1 * rng.standard_normal((runs, 2, 8, 2)).view(complex)[..., 0]
+    channel = SimpleNamespace(name="actuator", periods=2, harmonics=harmonics + 10, fault=lambda *_: True)
+    found = 0
+    for lines in 1 + noise:
+        channel.by_period = np.pad(lines, ((0, 0), (10, 0)))
+        found += clocks(channel) is not None
+    assert found <= stats.binom.isf(1e-3, runs, 1e-4)
 
 
 def test_offset_and_drift(record):
