@@ -261,7 +261,8 @@ class LinesPlan(FitPlan):
         """The model of coefficients (batch, n)."""
         if not self.structure.delay:
             return super().model_of(theta)
-        return replace(super().model_of(theta[:, :-1]), delay_s=theta[:, -1] * self.delay_unit_s)
+        unit_s = self.delay_unit_s
+        return replace(super().model_of(theta[:, :-1]), delay_s=theta[:, -1] * unit_s, delay_unit_s=unit_s)
 
     def fit(self, data: BinData) -> tuple[LinesPlan, Solution]:
         """Fit of all points of a batch, and the plan of its coefficients, which may have other bases."""

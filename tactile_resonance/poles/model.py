@@ -183,6 +183,8 @@ class RationalModel:
     variable : Variable
     denominator_basis, numerator_basis : PolynomialBasis
     delay_s : (...) float
+    delay_unit_s : float
+        Of the delay as the coefficient that follows those of B; 0 where it is none.
     """
 
     denominator: FloatArray
@@ -192,6 +194,7 @@ class RationalModel:
     denominator_basis: PolynomialBasis
     numerator_basis: PolynomialBasis
     delay_s: FloatArray | float = 0.0
+    delay_unit_s: float = 0.0
 
     def at(self, index: tuple[int, ...] | tuple[npt.NDArray[np.intp]]) -> RationalModel:
         """The model of one point of a batch, or of some of them."""
@@ -226,7 +229,7 @@ class RationalModel:
     def residues_and_sensitivity(
         self, poles_rad_s: ComplexArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Residues (..., k) of ``B / A`` at simple poles (..., k) [rad/s], and derivatives (..., k, n).
+        """Residues (..., k) of G at simple poles (..., k) [rad/s], and derivatives (..., k, n).
 
         In the z-domain residues are of the s-plane function with the same behaviour close to the pole. The
         derivatives are those of the poles by the free coefficients of A.
@@ -239,7 +242,14 @@ class RationalModel:
             self.denominator_basis.hessenberg,
             self.numerator_basis.hessenberg,
         )
-        return residues.reshape(x.shape), sensitivity.reshape(*x.shape, sensitivity.shape[-1])
+        turned = residues.reshape(x.shape) * self._turn(poles_rad_s)
+        return turned, sensitivity.reshape(*x.shape, sensitivity.shape[-1])
+
+    def _turn(self, poles_rad_s: ComplexArray) -> ComplexArray | float:
+        """(..., k) what the delay makes of residues at poles (..., k)."""
+        if not self.delay_unit_s:
+            return 1.0
+        return np.asarray(np.exp(-poles_rad_s * np.asarray(self.delay_s)[..., None]))
 
     def zero_sensitivity(self, zeros_rad_s: ComplexArray) -> ComplexArray:
         """(..., k, m + 1) derivative of simple zeros (..., k) by the coefficients of B."""
@@ -249,7 +259,7 @@ class RationalModel:
         return values * factor[..., None]
 
     def residue_sensitivity(self, poles_rad_s: ComplexArray) -> ComplexArray:
-        """(..., k, n + m + 1) derivative of the residues by the free coefficients of A, then B."""
+        """(..., k, n + m + 1) derivative of the residues by the free coefficients of A, B, and then a delay."""
         x = self.variable.of_s(poles_rad_s)
         values, slopes, bends = self.denominator_basis.at(x, 2)
         a1 = _dot(slopes, self.denominator)
@@ -263,12 +273,18 @@ class RationalModel:
         by_x = (b1 - residue * a2) / a1 * map_1 + residue * map_2
         by_alpha = by_x[..., None] * dx - (residue / a1 * map_1)[..., None] * slopes[..., :-1]
         by_beta = b_values * (map_1 / a1)[..., None]
-        return np.concatenate([by_alpha, by_beta], axis=-1)
+        if not self.delay_unit_s:
+            return np.concatenate([by_alpha, by_beta], axis=-1)
+        delay = np.asarray(self.delay_s)[..., None]
+        by_alpha -= (residue * map_1 * delay * map_1)[..., None] * dx
+        by_delay = -residue * map_1 * poles_rad_s * self.delay_unit_s
+        together = np.concatenate([by_alpha, by_beta, by_delay[..., None]], axis=-1)
+        return np.asarray(together * np.asarray(self._turn(poles_rad_s))[..., None])
 
     def residue_covariance(self, poles_rad_s: ComplexArray, coefficients: FloatArray) -> FloatArray:
         """(..., k, 2, 2) of (Re, Im) of the residues at simple poles (..., k).
 
-        Of `coefficients` (..., p, p), the covariance of the free ones of A, then B.
+        Of `coefficients` (..., p, p), the covariance of the free ones of A, then B, then a delay.
         """
         return real_covariance(self.residue_sensitivity(poles_rad_s), coefficients)
 

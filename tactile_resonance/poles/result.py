@@ -89,7 +89,7 @@ class Poles:
     damping_ratio : (n,) float
         ``-Re(pole) / |pole|``.
     residues : (n,) complex
-        Residue of G at each pole [rad/s].
+        Residue of G at each pole [rad/s], a delay of the model included.
     covariance : (n, 2, 2) float or None
         Of (f0_hz, damping_ratio), from noise.
     total_covariance : (n, 2, 2) float or None

@@ -10,9 +10,11 @@ from poles.mode_at_250_hz import BARE, LINES_HZ, W0, G, circular, frf
 from scipy import stats
 
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.poles.identify import identify_frf
+from tactile_resonance.poles.identify import identify_batch, identify_frf
 from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.model import PolynomialBasis
+from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 
 
@@ -161,6 +163,23 @@ def test_residues_and_zeros_scatter_as_their_covariances_say():
     total = np.sum(distances, axis=0)
     assert np.all(stats.chi2.ppf(5e-4, 2 * runs) < total)
     assert np.all(total < stats.chi2.ppf(1 - 5e-4, 2 * runs))
+
+
+def test_residues_of_a_model_with_a_delay_are_those_of_the_response():
+    """Residual terms stand for much of a delay: what it and the residue of B / A are off by cancels in G."""
+    runs, delay_s = 60, 1e-3
+    pole = W0 * complex(-0.02, np.sqrt(1 - 0.02**2))
+    residue = 0.04 * W0**2 / (pole - pole.conjugate()) * np.exp(-pole * delay_s)
+    g = G * np.exp(-2j * np.pi * LINES_HZ * delay_s) + circular(np.random.default_rng(6), (runs, 41), 1e-6)
+    structure = ModelStructure(2, 4, delay=True)
+    result = identify_batch(frf(g=g, noise_dof=1000), structure=structure)
+    used = np.flatnonzero(result.has_status(PolesStatus.OK))
+    assert used.size > 0.8 * runs
+    poles = [single(result, (int(k),)) for k in used]
+    errors = [np.array([e.real, e.imag]) for e in (each.residues[0] - residue for each in poles)]
+    covariances = [each.residue_covariance[0] for each in poles]
+    total = sum(e @ np.linalg.solve(c, e) for e, c in zip(errors, covariances, strict=True))
+    assert stats.chi2.ppf(5e-4, 2 * used.size) < total < stats.chi2.ppf(1 - 5e-4, 2 * used.size)
 
 
 def test_without_a_covariance_of_coefficients_there_is_none_of_residues_and_zeros():
