@@ -195,7 +195,7 @@ STATE = np.dtype(
         # of a motion: for how long it is learnt, its middle, mean squares of its size and of its speed
         *[(n, float) for n in ("learnt_s", "middle_m", "middle_n", "way_m2", "speed_m2_s2")],
         # what stays: see `ContactFilter`
-        *[(name, float) for name in ("noise_n", "vibration_m", "beam_n_per_m", "inflation")],
+        *[(name, float) for name in ("noise_n", "vibration_m", "beam_n_per_m")],
     ]
 )
 
@@ -323,7 +323,7 @@ def _follow(states, dt_s, height_m, force_n):
     s.surface_m, s.speed_m_s = surface + ph0 * step, speed + ph1 * step
     s.ln_c, s.rate_per_s = ln_c + ph2 * step, rate + ph3 * step
     innovation = error / math.sqrt(spread)
-    seen = _judge(s, innovation / s.inflation, dt_s)
+    seen = _judge(s, innovation, dt_s)
     gain0, gain1, gain2, gain3 = ph0 / spread, ph1 / spread, ph2 / spread, ph3 / spread
     s.p00, s.p01, s.p02 = p00 - gain0 * ph0, p01 - gain0 * ph1, p02 - gain0 * ph2
     s.p03, s.p12, s.p13 = p03 - gain0 * ph3, p12 - gain1 * ph2, p13 - gain1 * ph3
@@ -344,13 +344,12 @@ class ContactFilter:
     heights_m, forces_n : sequences of float
         The last samples, oldest first, the touch among them.
     noise_n : float
-        Standard deviation of one force [N].
+        Standard deviation of one force [N]; where neighbouring ones are alike, that of white noise whose means
+        scatter as much.
     beam_n_per_m : float
         Stiffness of the beam in series [N/m]; `RIGID` without.
     vibration_m : float
         Unseen vibration of the tip [m] rms: at stiff tissue it adds to the noise.
-    inflation : float
-        By which means of forces scatter more than white noise lets them.
 
     Attributes
     ----------
@@ -375,7 +374,6 @@ class ContactFilter:
         noise_n: float,
         beam_n_per_m: float = RIGID,
         vibration_m: float = 3e-6,
-        inflation: float = 1.0,
     ) -> None:
         mean, covariance = touch_posterior(
             np.asarray(heights_m, float), np.asarray(forces_n, float), noise_n, beam_n_per_m
@@ -390,8 +388,7 @@ class ContactFilter:
             **{"surface_m": self.surface_m, "ln_c": ln_c, "rate_per_s": RATE_MEAN_PER_S},
             **{"p00": p00, "p02": p02, "p22": p22, "p33": RATE_STD_PER_S**2},
             **{"ln_intensity": LEAST, "square": 1.0},
-            **{"noise_n": noise_n, "vibration_m": vibration_m},
-            **{"beam_n_per_m": beam_n_per_m, "inflation": inflation},
+            **{"noise_n": noise_n, "vibration_m": vibration_m, "beam_n_per_m": beam_n_per_m},
         }.items():
             self.state[name] = value
 

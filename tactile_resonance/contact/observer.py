@@ -265,6 +265,9 @@ class Observer:
         The bias, once there is one.
     noise_n, bias_std_n : float
         Of one force and of the bias, from the last tare [N].
+    scatter_n : float
+        Of white noise whose means scatter as much as those of the forces do [N]: more than `noise_n` where
+        neighbouring forces are alike, as behind a filter.
     """
 
     def __init__(self, parameters: ContactParameters, limits: Limits) -> None:
@@ -278,7 +281,7 @@ class Observer:
         self.touched_m: float | None = None
         self._unloaded: list[WrenchSample] = []
         self.zero: Zero | None = None
-        self.noise_n = self.bias_std_n = 0.0
+        self.noise_n = self.scatter_n = self.bias_std_n = 0.0
         self._heights: deque[tuple[int, float]] = deque(maxlen=50)  # time, height
         self._accelerations: deque[tuple[int, float]] = deque(maxlen=50)  # middle of period, m/s2
         self._carried_kg = p.carried_kg
@@ -287,7 +290,6 @@ class Observer:
         self._window: deque[tuple[float, float]] = deque(maxlen=WINDOW_SAMPLES)
         self._detector: TouchDetector | None = None
         self._model_ns = 0
-        self._inflation = 1.0
         self._sum_n, self._count = 0.0, 0
 
     def begin_tare(self) -> None:
@@ -325,9 +327,7 @@ class Observer:
         self.watch.set_bias(vector(zero.force_n))
         self.noise_n = max(LEAST_NOISE_N, noise)
         self.bias_std_n = float(zero.std_n[2])
-        # neighbouring forces that are alike make means less certain than white noise would
-        inflation = float(look.std_n[2]) * math.sqrt(len(self._unloaded)) / noise
-        self._inflation = max(1.0, inflation)
+        self.scatter_n = max(self.noise_n, float(look.std_n[2]) * math.sqrt(len(self._unloaded)))
         self.seek_touch()
         return None
 
@@ -335,7 +335,7 @@ class Observer:
         """Forget the contact and look for a touch."""
         self.model = self.touched_m = None
         self._window.clear()
-        self._detector = TouchDetector(self._inflation * self.noise_n, self.bias_std_n)
+        self._detector = TouchDetector(self.scatter_n, self.bias_std_n)
 
     def begin_mean(self) -> None:
         """Average the force from now on."""
@@ -345,7 +345,7 @@ class Observer:
         """Mean force since `begin_mean` and its deviation from noise and tare [N]; None if none."""
         if self._count == 0:
             return None
-        std = math.hypot(self.noise_n / math.sqrt(self._count), self.bias_std_n)
+        std = math.hypot(self.scatter_n / math.sqrt(self._count), self.bias_std_n)
         return self._sum_n / self._count, std
 
     def take(self, wrenches: Sequence[WrenchSample], arm_ns: int, height_m: float) -> Breach | None:
@@ -389,10 +389,9 @@ class Observer:
         self.model = ContactFilter(
             heights,
             forces,
-            noise_n=self.noise_n,
+            noise_n=self.scatter_n,
             beam_n_per_m=self.parameters.beam_n_per_m,
             vibration_m=self.parameters.arm_vibration_m,
-            inflation=self._inflation,
         )
         if self.touched_m is None:
             self.touched_m = self.model.surface_m

@@ -215,7 +215,7 @@ class Outcome:
         if zero_n is not None:
             # the second zero is a mean over as long as a lost contact is
             count = observer.limits.lost_s / observer.parameters.period_s
-            zero_std_n = math.hypot(observer.bias_std_n, observer.noise_n / math.sqrt(count))
+            zero_std_n = math.hypot(observer.bias_std_n, observer.scatter_n / math.sqrt(count))
             # of what is no noise, the mean may have any part between nothing and all
             moved_n = math.sqrt(max(0.0, zero_n**2 - zero_std_n**2))
             std = None if std is None else math.hypot(std, moved_n / 2)

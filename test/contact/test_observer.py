@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tare: its stated uncertainty against Monte Carlo, and what it refuses."""
+"""The tare and what is measured with it: stated uncertainties against Monte Carlo; what a tare refuses."""
 
 import math
 from dataclasses import replace
@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.observer import TareError, tare
-from tactile_resonance.contact.parameters import ContactParameters
+from tactile_resonance.contact.contact_filter import RIGID, hertz_force
+from tactile_resonance.contact.observer import Observer, TareError, tare
+from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.contact.vectors import vector
 
@@ -95,3 +96,57 @@ def test_what_is_no_measurement_is_refused(readings, reason):
 def test_an_offset_that_no_bias_explains_is_refused():
     with pytest.raises(TareError, match=r"Fx reads .* without contact, accepted are up to 15 mN"):
         tare(samples(), replace(LIMITS, tare_offset_n=0.015), 0)
+
+
+C, SPEED_M_S, ABOVE_M, PRESSED_M = 800.0, 4e-3, 8e-4, 4e-4
+
+
+def pressed(seed, keep):
+    """Observer of a tip that came down on still tissue whose surface is at 0, and rests there."""
+    parameters = ContactParameters(beam_stiffness_n_per_m=0.0)
+    observer = Observer(parameters, Limits())
+    rng, noise, t_ns, height = np.random.default_rng(seed), 0.0, 0, ABOVE_M
+    # such that means of many scatter as those of white noise of 1 mN
+    rms = 1e-3 * math.sqrt((1 - keep) / (1 + keep))
+
+    def take(count):
+        nonlocal noise, t_ns, height
+        noise = noise or rng.standard_normal()
+        for _ in range(count):
+            height = max(-PRESSED_M, height - (0.0 if observer.taring else SPEED_M_S * 2e-3))
+            noise = keep * noise + math.sqrt(1 - keep**2) * rng.standard_normal()
+            force = hertz_force(-height, C, RIGID)[0] + rms * noise
+            wrench = (*(1e-4 * rng.standard_normal(2)), force)
+            t_ns += 2_000_000
+            assert (
+                observer.take([WrenchSample(t_ns, wrench, (0.0,) * 3, False)], t_ns, height) is None
+            )
+
+    observer.begin_tare()
+    take(200)
+    assert observer.end_tare(t_ns) is None
+    take(330)
+    observer.begin_mean()
+    take(40)
+    return observer
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.8])
+def test_what_is_stated_of_a_contact_is_as_uncertain_as_stated_also_behind_a_filter(keep):
+    z = []
+    for seed in range(120):
+        observer = pressed(seed, keep)
+        estimate, (mean_n, mean_std_n) = observer.model.estimate(-PRESSED_M), observer.mean_force()
+        true_n = hertz_force(PRESSED_M, C, RIGID)[0]
+        std_n = math.hypot(estimate.force_std_n, observer.bias_std_n)
+        z.append(
+            [
+                (mean_n - true_n) / mean_std_n,
+                (estimate.force_n - true_n) / std_n,
+                estimate.surface_m / estimate.depth_std_m,
+            ]
+        )
+    # chi square over 120: within four standard errors, and no less certain than half of it
+    square = np.mean(np.square(z), axis=0)
+    assert np.all(square < 1 + 4 * math.sqrt(2 / 120)), square
+    assert np.all(square > 0.4), square
