@@ -112,8 +112,11 @@ def tare(
     residual = force - mean - t[:, None] * slope
     rms = np.sqrt((residual**2).sum(axis=0) / (n - 2))
     inflation = _inflation(residual)
-    mean_std = inflation * rms / math.sqrt(n)
-    slope_std = inflation * rms / math.sqrt(t @ t)
+    # mean and slope take more of noise whose neighbours are alike with them than of white noise
+    left = np.maximum(n - 2 * inflation**2, n / 4)
+    scatter = inflation * rms * np.sqrt((n - 2) / left)
+    mean_std = scatter / math.sqrt(n)
+    slope_std = scatter / math.sqrt(t @ t)
     figures = np.stack([mean, mean_std, rms, slope, slope_std], axis=1).tolist()
     for name, of_axis in zip("xyz", figures, strict=True):
         _check_zero(parameters, name, *of_axis)
@@ -124,12 +127,12 @@ def _inflation(residual: FloatArray) -> FloatArray:
     """How much wider (3,) than for white noise the mean scatters, from neighbouring samples' correlation.
 
     For noise behind a first-order low-pass, sqrt((1 + r) / (1 - r)); the estimate of r is biased by about
-    -(1 + 4 r) / n (Marriott and Pope, Biometrika 41, 1954).
+    -(1 + 4 r) / n about a mean (Marriott and Pope, Biometrika 41, 1954), about a line by one -(1 + r) / n more.
     """
     n = len(residual)
     power = (residual**2).sum(axis=0)
     r = (residual[1:] * residual[:-1]).sum(axis=0) / np.where(power > 0, power, 1.0)
-    r = np.clip(r + (1 + 4 * r) / n, 0.0, 0.999)
+    r = np.clip(r + (2 + 5 * r) / n, 0.0, 0.999)
     return np.sqrt((1 + r) / (1 - r))
 
 
