@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
+from scipy.sparse import csr_array
 
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.array_files import read_arrays
@@ -29,6 +31,8 @@ from tactile_resonance.fields import (
 )
 
 MOST_SEARCH_M = 0.02
+EDGE_RAD = 0.7
+"""Between the normals of faces of a mesh that meet in an edge; less is a round surface."""
 _INSIDE = 1e-9  # of the barycentric coordinates: points on a shared edge belong to both triangles
 
 
@@ -139,15 +143,16 @@ class TriangleMesh(Surface):
 
     Normals are those of the corners, interpolated over each triangle, so that a finely meshed organ is
     smooth; the normal of a corner is the mean of its faces' weighted by their angles there (Thuermer and
-    Wuethrich, J. Graphics Tools 3 (1998) 43; trimesh computes it). A sharp edge is rounded over the triangles
-    beside it.
+    Wuethrich, J. Graphics Tools 3 (1998) 43), for each triangle of those turned against it by no more than
+    `EDGE_RAD`: a sharper edge stays one, and the flat top of a block is flat up to it.
 
     Attributes
     ----------
     corners_m : (c, 3) float
     faces : (t, 3) int
         Indices into the corners.
-    corner_normals : (c, 3) float
+    corner_normals : (t, 3, 3) float
+        Of each triangle's corners.
     """
 
     corners_m: FloatArray
@@ -184,7 +189,8 @@ class TriangleMesh(Surface):
         mesh.faces = faces
         accepted = "one winding for all"
         require(mesh.is_winding_consistent, "triangles", "edges run twice in one sense", accepted)
-        return cls(low + size * mesh.vertices, np.asarray(faces), np.asarray(mesh.vertex_normals))
+        normals = _corner_normals(np.asarray(faces), mesh.face_normals, mesh.face_angles)
+        return cls(low + size * mesh.vertices, np.asarray(faces), normals)
 
     def at(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(...) height [m] and (..., 3) upward unit normal of the topmost face, NaN beside the mesh."""
@@ -204,11 +210,25 @@ class TriangleMesh(Surface):
                 continue
             height = np.where(hit, np.sum(weights * triangles[near, :, 2], axis=1), -np.inf)
             top = int(np.argmax(height))
-            normal = weights[top] @ self.corner_normals[self.faces[near[top]]]
+            normal = weights[top] @ self.corner_normals[near[top]]
             heights[i] = height[top]
             # the topmost face looks upwards, however the mesh is wound
             normals[i] = normal / np.linalg.norm(normal) * np.copysign(1.0, normal[2])
         return heights.reshape(xy.shape[:-1]), normals.reshape(*xy.shape[:-1], 3)
+
+
+def _corner_normals(faces: IntArray, normals: FloatArray, angles_rad: FloatArray) -> FloatArray:
+    """(t, 3, 3) unit normals at the corners of faces (t, 3) with normals (t, 3) and angles (t, 3)."""
+    count = faces.size
+    at = csr_array((np.ones(count), (np.arange(count), faces.ravel())))  # (3 t, c)
+    pairs = (at @ at.T).tocoo()  # corners of faces at one place
+    one, other = normals[pairs.row // 3], normals[pairs.col // 3]
+    # a face too thin to have a normal takes those of all
+    alike = np.sum(one * other, axis=1) >= math.cos(EDGE_RAD) * np.sum(one * one, axis=1)
+    weights = csr_array((angles_rad.ravel()[pairs.col] * alike, (pairs.row, pairs.col)), shape=pairs.shape)
+    summed = weights @ np.repeat(normals, 3, axis=0)
+    length = np.linalg.norm(summed, axis=1, keepdims=True)
+    return np.asarray(summed / np.where(length > 0, length, 1.0)).reshape(-1, 3, 3)
 
 
 def read_stl(path: Path) -> FloatArray:

@@ -104,6 +104,24 @@ def test_mesh_of_a_sphere_converges_to_the_sphere(flip):
     assert np.isnan(mesh.height_m([0.049, 0.0]))
 
 
+def block(size, top, flip):
+    """(12, 3, 3) triangles of a block, two to a side as CAD writes them."""
+    x, y, z = np.meshgrid(*[[-size, size]] * 2, [0.0, top], indexing="ij")
+    p = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    quads = [(0, 2, 6, 4), (1, 5, 7, 3), (0, 4, 5, 1), (2, 3, 7, 6), (0, 1, 3, 2), (4, 6, 7, 5)]
+    faces = [tri for a, b, c, d in quads for tri in ((a, b, c), (a, c, d))]
+    return p[np.array(faces)][:, ::-1] if flip else p[np.array(faces)]
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_the_flat_top_of_a_block_is_flat_up_to_its_edges(flip):
+    mesh = TriangleMesh.from_triangles(block(0.025, 0.01, flip))
+    xy = np.random.default_rng(4).uniform(-0.0249, 0.0249, (200, 2))
+    height, normal = mesh.at(xy)
+    np.testing.assert_allclose(height, 0.01, rtol=1e-12)
+    np.testing.assert_allclose(normal, np.broadcast_to([0.0, 0.0, 1.0], (200, 3)), atol=1e-12)
+
+
 def test_the_topmost_face_counts():
     low = np.array([[[-1, -1, 0], [1, -1, 0], [0, 2, 0]]], float)
     mesh = TriangleMesh.from_triangles(np.concatenate([low, low / 4 + [0, 0, 0.5]]))
