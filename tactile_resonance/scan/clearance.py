@@ -91,7 +91,8 @@ def lowest_between(first: ScanPoint, then: ScanPoint, surface: Surface, use: Tip
     Infinite where nothing of the surface is known.
     """
     poses = way_between(first, then, use)
-    body, lowest = _body(use.tip), math.inf
+    # beside its lowest place the ball may meet what rises steeply
+    body, lowest = np.vstack([_body(use.tip), _ball(use.tip.ball_radius_m)]), math.inf
     drop = np.zeros(len(body))
     drop[0] = use.tip.ball_radius_m
     for start, end in zip(poses[:-1], poses[1:], strict=True):
@@ -121,6 +122,13 @@ def _body(tip: TipGeometry) -> FloatArray:
     """(k, 3) the ball's centre, places along the beam and the housing's lower edge, in the frame `tip`."""
     beam = np.linspace(0, 1, BEAM_PLACES)[:, None] * tip.sensor.position_m
     return np.vstack([beam, tip.housing_m])
+
+
+def _ball(radius_m: float) -> FloatArray:
+    """(16, 3) places on the ball half and all of its radius beside its axis, in the frame `tip`."""
+    along = np.arange(8) * math.pi / 4
+    beside = np.column_stack([np.cos(along), np.sin(along), np.zeros(8)])
+    return radius_m * np.vstack([beside / 2 - [0.0, 0.0, math.sqrt(0.75)], beside])
 
 
 def _tip_pose(point: ScanPoint, height_m: float) -> Pose:

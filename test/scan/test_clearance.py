@@ -73,6 +73,19 @@ def test_over_a_bend_the_housing_is_lower_by_the_square_of_its_distance(radius_m
     assert lowest_at_depth(along, surface, USE) == pytest.approx(flat, abs=1e-9)
 
 
+def test_a_way_beside_a_step_is_met_by_the_side_of_the_ball():
+    # at 0.7 mm beside the way it rises by 4.2 mm; the ball's lowest place is 3 mm high, at half of its radius
+    # beside that 2.5 mm less sqrt(2.5^2 - 1.25^2) mm higher
+    rise = field(lambda x, y: 2.1e-3 * (1 + np.tanh((y - 7e-4) / 2e-4)) + 0 * x, 0.01, 1e-4)
+    points = planned(Plane(), [[-1e-3, 0.0], [1e-3, 0.0]]).points
+    side = 3e-3 + 2.5e-3 * (1 - np.sqrt(0.75)) - 2.1e-3 * (1 + np.tanh(2.75))
+    low = lowest_between(*points, rise, USE)
+    assert low == pytest.approx(side, abs=5e-5)
+    # over a plane it is the lowest place of the ball that counts
+    flat = lowest_between(*points, Plane(), USE)
+    assert flat == pytest.approx(USE.parameters.standoff_m, abs=1e-12)
+
+
 def test_wall_beside_the_tip_is_met_by_the_beam_though_the_housing_is_clear():
     wall = field(lambda x, y: 4e-3 * np.exp(-(((x + 0.035) / 3e-3) ** 2)) + 0 * y)
     (point,) = planned(wall, [[0.0, 0.0]]).points
