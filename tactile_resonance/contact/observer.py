@@ -69,7 +69,9 @@ class Zero:
         off = look.force_n - self.force_n
         if np.any(off**2 > STEPPED**2 * (variance + seen)):
             return None
-        gain = variance / (variance + seen)
+        total = variance + seen
+        # an axis that shows one number and does not walk is known
+        gain = np.divide(variance, total, out=np.ones_like(total), where=total > 0)
         return Zero(self.force_n + gain * off, np.sqrt(gain * seen), look.time_ns)
 
 

@@ -57,3 +57,12 @@ def test_looks_never_make_it_less_certain():
         assert np.all(zero.std_n < before.std_n)
     # without a walk it is the weighted mean of all
     assert zero.std_n[0] == pytest.approx((1e6 + 19 / STD_N**2) ** -0.5)
+
+
+def test_an_axis_that_shows_one_number_is_known_by_it():
+    one = np.array([0.0, 0.0, STD_N])  # a cell of one axis
+    before = Zero(np.array([0.0, 1e-3, 0.0]), one, 0)
+    zero = before.with_look(Zero(np.array([0.0, 1e-3, 0.0]), one, 10**9), 0.0)
+    np.testing.assert_allclose(zero.force_n, [0.0, 1e-3, 0.0])
+    np.testing.assert_allclose(zero.std_n, [0.0, 0.0, STD_N / np.sqrt(2)])
+    assert before.with_look(Zero(np.array([1e-6, 1e-3, 0.0]), one, 10**9), 0.0) is None
