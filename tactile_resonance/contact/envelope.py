@@ -125,6 +125,11 @@ class ForceWatch:
         """Mean force along z over the last `mean_s` [N]; None where less than that is there."""
         return self._sum_n / len(self._averaged) if self._full else None
 
+    @property
+    def mean_count(self) -> int:
+        """Of forces in `mean_n`."""
+        return len(self._averaged)
+
     def rate_n_per_s(self) -> float | None:
         """Rise of the force along z over 10 ms [N/s], from means of three; None where too few."""
         times, forces = self._times_ns, self._forces_n

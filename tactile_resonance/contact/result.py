@@ -213,8 +213,8 @@ class Outcome:
             return
         message, std = result.message, result.force_std_n
         if zero_n is not None:
-            # the second zero is a mean over as long as a lost contact is
-            count = observer.limits.lost_s / observer.parameters.period_s
+            # the second zero is a mean over as long as a lost contact is, or longer
+            count = max(1, observer.watch.mean_count)
             zero_std_n = math.hypot(observer.bias_std_n, observer.scatter_n / math.sqrt(count))
             # of what is no noise, the mean may have any part between nothing and all
             moved_n = math.sqrt(max(0.0, zero_n**2 - zero_std_n**2))

@@ -10,6 +10,7 @@ import pytest
 from tactile_resonance.contact.contact_filter import RIGID, hertz_force
 from tactile_resonance.contact.observer import Observer, TareError, tare
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.result import Breach, Cause, Outcome
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.contact.vectors import vector
 
@@ -150,3 +151,27 @@ def test_what_is_stated_of_a_contact_is_as_uncertain_as_stated_also_behind_a_fil
     square = np.mean(np.square(z), axis=0)
     assert np.all(square < 1 + 4 * math.sqrt(2 / 120)), square
     assert np.all(square > 0.4), square
+
+
+@pytest.mark.parametrize("rate_hz", [200, 500, 1000])
+def test_a_zero_has_moved_beyond_four_deviations_of_the_forces_that_came(rate_hz):
+    rng, observer = np.random.default_rng(rate_hz), Observer(ContactParameters(), Limits())
+    every_ns = round(1e9 / rate_hz)
+
+    def take(first, last):
+        for n in range(first, last):
+            wrench = vector(1e-3 * rng.standard_normal(3))
+            sample = WrenchSample(n * every_ns, wrench, (0.0,) * 3, False)
+            assert observer.take([sample], n * every_ns, 0.0) is None
+
+    observer.begin_tare()
+    take(1, 400)
+    assert observer.end_tare(400 * every_ns) is None
+    take(400, 500)
+    # a mean over 50 ms
+    std_n = math.hypot(observer.bias_std_n, observer.scatter_n / math.sqrt(0.05 * rate_hz))
+    for share, moved in ((3.9, False), (4.1, True)):
+        outcome = Outcome(observer, 0)
+        outcome.ended(Breach(Cause.CANCELLED, ""), 500 * every_ns, None, holding=False)
+        outcome.drawn_back(share * std_n)
+        assert (outcome.result(holding=False).zero_change_n != 0.0) == moved
