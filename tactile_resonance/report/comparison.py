@@ -79,6 +79,8 @@ class Difference:
 def differences(first: RunContent, other: RunContent) -> list[Difference]:
     """At each place of the first run within 0.1 mm of one of the other, in one frame, where both have poles.
 
+    Of several points at one place each is compared once, with one of the other run: differences that share a
+    point would not be independent.
     Poles at the nominal contact are compared where both points have them and both scenes mean one force and age
     by it: their covariance holds what force and age of contact add. An error of the sensitivity to these is
     common to both, so it is counted twice.
@@ -90,13 +92,21 @@ def differences(first: RunContent, other: RunContent) -> list[Difference]:
     )
     if not points or not others:
         return []
-    tree = cKDTree([r.position_m for r in others])
-    distance_m, nearest = tree.query([r.position_m for r in points])
-    pairs = [
-        _difference(point, others[k], one_contact)
-        for point, m, k in zip(points, distance_m, nearest, strict=True)
-        if m <= SAME_PLACE_M and point.frame_id == others[k].frame_id
-    ]
+    places_m, others_m = (np.array([r.position_m for r in of]) for of in (points, others))
+    near = cKDTree(others_m).query_ball_point(places_m, SAME_PLACE_M)
+    candidates = sorted(
+        (float(np.linalg.norm(places_m[k] - others_m[j])), k, j)
+        for k, found in enumerate(near)
+        for j in found
+        if points[k].frame_id == others[j].frame_id
+    )
+    other_of: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, k, j in candidates:  # the nearest first
+        if k not in other_of and j not in taken:
+            other_of[k] = j
+            taken.add(j)
+    pairs = [_difference(points[k], others[j], one_contact) for k, j in sorted(other_of.items())]
     return [pair for pair in pairs if np.all(np.isfinite(pair.covariance))]
 
 

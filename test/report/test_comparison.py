@@ -35,7 +35,8 @@ def drawn(count, seed, shift=(0.0, 0.0), **values):
     columns = {"f0_std_hz": STD[0], "damping_ratio_std": STD[1], "y_m": 0.0, "z_m": 0.0}
     columns |= {"f0_damping_covariance_hz": COVARIANCE[0, 1], "frame_id": "table"} | values
     return run_of(
-        PointResult(k, x_m=1e-3 * k, f0_hz=f0, damping_ratio=z, **columns) for k, (f0, z) in enumerate(poles)
+        PointResult(k, f0_hz=f0, damping_ratio=z, **{"x_m": 1e-3 * k, **columns})
+        for k, (f0, z) in enumerate(poles)
     )
 
 
@@ -75,6 +76,27 @@ def test_only_equal_places_with_poles_are_compared():
     assert [(each.first.index, each.other.index) for each in found] == [(0, 0)]
     assert "no place in common" in sentence("b", "a", [])
     assert differences(first, run_of([])) == []
+
+
+def test_of_repetitions_at_one_place_each_is_compared_once():
+    # what chance gives is uniform only where no two differences share a point
+    chances = []
+    for seed in range(200):
+        runs = (drawn(20, [seed, which], x_m=0.0) for which in range(2))
+        found = differences(*runs)
+        assert len({each.other.index for each in found}) == len(found) == 20
+        chances.append(stats.chi2.sf(sum(each.distance2 for each in found), 40))
+    assert stats.kstest(chances, "uniform").pvalue > 1e-3
+    some = differences(drawn(3, 1, x_m=0.0), drawn(2, 2, x_m=0.0))
+    assert [(each.first.index, each.other.index) for each in some] == [(0, 0), (1, 1)]
+
+
+def test_the_nearest_points_of_the_same_frame_are_compared():
+    first, other = drawn(2, 1, x_m=0.0), drawn(3, 2, x_m=0.0)
+    moved = [replace(each, x_m=x) for each, x in zip(other.results, (5e-5, 0.0, 1e-5), strict=True)]
+    moved[1] = replace(moved[1], frame_id="base")
+    found = differences(first, run_of(moved))
+    assert [(each.first.index, each.other.index) for each in found] == [(0, 2), (1, 0)]
 
 
 def test_poles_at_the_nominal_contact_are_compared_where_both_are_known():
