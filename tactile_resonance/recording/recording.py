@@ -350,15 +350,23 @@ def read_recording(
 
 
 def _sample_rate(fields: Mapping[str, np.ndarray], path: Path) -> float:
-    if "sample_rate_hz" in fields:
-        return _scalar(fields, "sample_rate_hz")
+    rate_hz = _scalar(fields, "sample_rate_hz") if "sample_rate_hz" in fields else None
     if "time_s" in fields:
         time_s = np.ravel(fields["time_s"])
         step = np.diff(time_s)
-        if step.size == 0 or not np.all(np.abs(step - step.mean()) < 0.01 * step.mean()):
+        alike = step.size > 0 and bool(np.all(np.abs(step - step.mean()) < 0.01 * step.mean()))
+        if rate_hz is None and not alike:
             steps = f"steps of {step.min():.6g} to {step.max():.6g} s" if step.size else "one sample"
             raise ValueError(f"time_s: {steps}, expected steps that are alike within 1 %")
-        return float(1 / step.mean())
+        if rate_hz is None:
+            return float(1 / step.mean())
+        if alike and abs(rate_hz * step.mean() - 1) > 0.01:
+            raise ValueError(
+                f"sample_rate_hz: {rate_hz:g} in {path.name}, where steps of time_s are {step.mean():.6g} s: "
+                "expected the same rate of both, or the right one given"
+            )
+    if rate_hz is not None:
+        return rate_hz
     raise ValueError(f"sample_rate_hz: missing in {path.name}, expected there or given")
 
 

@@ -216,6 +216,17 @@ def test_times_that_are_not_even_are_named(tmp_path):
         read_recording(tmp_path / "a.csv")
 
 
+def test_times_and_a_rate_that_contradict_each_other_are_refused(tmp_path, fields):
+    path = tmp_path / "a.npz"
+    for time_s in (np.arange(24) / 10.0, np.round(np.arange(24) / 10.0)):  # of the second each step is another
+        np.savez(path, **fields, time_s=time_s)
+        assert read_recording(path).sample_rate_hz == 10.0
+    np.savez(path, **fields, time_s=np.arange(24) / 50.0)
+    with pytest.raises(ValueError, match=r"sample_rate_hz: 10 in a.npz, where steps of time_s are 0.02 s"):
+        read_recording(path)
+    assert read_recording(path, sample_rate_hz=50.0).sample_rate_hz == 50.0
+
+
 def test_missing_fields_are_named_with_those_present(tmp_path, fields):
     for name in ("u", "y", "sample_rate_hz"):
         left = {key: value for key, value in fields.items() if key != name}
