@@ -38,6 +38,7 @@ from tactile_resonance.scan.points import (
 from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.scan.scene import Output, ScanScene, residual_terms_of
 from tactile_resonance.scan.surface import Plane, Surface, TouchRequest
+from tactile_resonance.scan.tissue_tests import ProtocolRequest
 from tactile_resonance.sensor import MAX_LEVEL_V
 
 STEEPEST_RAD = np.pi / 3
@@ -105,8 +106,10 @@ class Plan:
 
     @cached_property
     def shortest_s(self) -> float:
-        """With the fewest points and blocks [s]."""
-        return self.duration_s(self.measurement.blocks.least, len(self.first_points))
+        """With the fewest points and blocks, and of tests what they hold [s]."""
+        count = len(self.first_points)
+        held_s = sum(asked.hold_s * _tested(asked, count) for asked in self.scene.protocols)
+        return count * self.point_s(self.measurement.blocks.least) + held_s
 
     @cached_property
     def longest_s(self) -> float:
@@ -114,11 +117,9 @@ class Plan:
         return self.duration_s(self.measurement.blocks.most)
 
     def duration_s(self, blocks: int, points: int | None = None) -> float:
-        """Time of so many points, by default the most, with so many blocks each, and their tests [s]."""
+        """Of so many points, by default the most, with so many blocks each, and with the longest tests [s]."""
         count = self.most_points if points is None else points
-        tests_s = sum(
-            asked.longest_s * (len(asked.points) or count) for asked in self.scene.protocols
-        )
+        tests_s = sum(asked.longest_s * _tested(asked, count) for asked in self.scene.protocols)
         return count * self.point_s(blocks) + tests_s
 
     def point_s(self, blocks: int) -> float:
@@ -233,6 +234,11 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
     return replace(plan, left_out=left_out)
 
 
+def _tested(asked: ProtocolRequest, points: int) -> int:
+    """At how many of so many points a test is made."""
+    return sum(map(asked.concerns, range(points)))
+
+
 def _in_mm(point: ScanPoint) -> str:
     x, y, _ = point.position_m
     return f"x = {1e3 * x:.2f}, y = {1e3 * y:.2f} mm"
@@ -296,7 +302,8 @@ def plan_rows(plan: Plan) -> list[tuple[str, str]]:
     if Output.MAP in scene.outputs:
         drawn += [*map_names(len(design.bands)), "map.mcap"]
     rows.append(("drawn", ", ".join(drawn)))
-    rows.append(("time", f"{plan.shortest_s:.0f} to {plan.longest_s:.0f} s"))
+    search = f", and about {before * CONTACT_S:.0f} s for surface and normals before" if before else ""
+    rows.append(("time", f"{plan.shortest_s:.0f} to {plan.longest_s:.0f} s{search}"))
     rows += [("limit", text) for text in _limits(plan)]
     for left in plan.skipped:
         saved = f"; saves up to {left.saved_s:.1f} s" if left.saved_s else ""

@@ -14,7 +14,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.scan.decision import BlockLimits, Gate, Precise, Verdict, decide
-from tactile_resonance.scan.plan import make_plan, plan_against_outcome, plan_rows
+from tactile_resonance.scan.plan import CONTACT_S, make_plan, plan_against_outcome, plan_rows
 from tactile_resonance.scan.scene import Output, TimeLimits, read_run_scene, read_scan_scene
 from tactile_resonance.scan.surface import NormalRequest, TouchRequest
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
@@ -49,10 +49,24 @@ def test_a_plan_says_what_each_part_of_a_scene_leads_to():
     )
     rows = told(asked)
     assert rows["touches"] == ["18: 3 points, 15 for surface and normals"]
+    (time,) = rows["time"]  # each touch about as long as a contact
+    assert time.endswith(f" s, and about {15 * CONTACT_S:.0f} s for surface and normals before")
     assert rows["poles"][1] == "600 to 800 Hz, one to three modes, as the data choose"
     assert rows["distortion"] == ["even and odd, at input and output, in each band of poles"]
     assert rows["drawn"] == ["report.html"]
     assert any("no map is wanted" in text for text in rows["skipped"])
+
+
+def test_tests_take_what_they_hold_or_longer_at_the_points_they_are_asked_for():
+    asked = scene(points=3)
+    relaxation = ProtocolRequest(Protocol.RELAXATION, hold_s=10.0, points=(1, 3))
+    plans = [make_plan(replace(asked, protocols=tests)) for tests in ((), (relaxation,))]
+    shortest_s, longest_s = ([getattr(plan, name) for plan in plans] for name in ("shortest_s", "longest_s"))
+    assert np.diff(shortest_s) == pytest.approx(2 * 10.0)
+    assert np.diff(longest_s) == pytest.approx(2 * relaxation.longest_s)
+    # of a scan that has time for that no limit is told
+    limits = TimeLimits(scan_s=shortest_s[1] + 1.0)
+    assert "limit" not in told(replace(asked, protocols=(relaxation,), time_limits=limits))
 
 
 def test_the_outcome_stands_beside_the_plan(tmp_path):
