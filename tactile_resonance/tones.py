@@ -124,6 +124,7 @@ class SilentRecord:
     actuator_noise, sensor_noise : float
         Median over the band of the square root of the one-sided power density [V/sqrt(Hz)].
     band_hz : (float, float)
+        In which tones and noise were looked for: not below `FIRST_BIN` over the length of a record.
     """
 
     tones: tuple[Tone, ...]
@@ -138,7 +139,7 @@ class SilentRecord:
             f"{name}: noise {level:.2g} V/sqrt(Hz), median from {low:g} to {high:g} Hz"
             for name, level in (("actuator", self.actuator_noise), ("sensor", self.sensor_noise))
         ]
-        lines += [tone.text() for tone in self.tones[:MOST_NAMED]] or ["no tones"]
+        lines += [tone.text() for tone in self.tones[:MOST_NAMED]] or [f"no tones from {low:g} to {high:g} Hz"]
         if len(self.tones) > MOST_NAMED:
             lines.append(f"and {len(self.tones) - MOST_NAMED} smaller ones")
         return "\n".join(lines)
@@ -193,7 +194,9 @@ def silent_record(
         level, around = level_around(power, kind, len(pieces), _WINDOW)
         if not around:
             raise ValueError(
-                f"band_hz: {edges[0]:g}..{edges[1]:g} Hz hold {kind.sum()} bins, expected 8 or more"
+                f"band_hz: {edges[0]:g}..{edges[1]:g} Hz hold {kind.sum()} bins above the "
+                f"{FIRST_BIN * resolution_hz:g} Hz from which a record of this length shows tones, "
+                "expected 8 or more"
             )
         density = np.median(level[kind]) * 2 / (sample_rate_hz * np.sum(window**2))
         noise.append(float(np.sqrt(density)))
@@ -201,7 +204,8 @@ def silent_record(
             rms_v = np.sqrt(2 * size) / np.sum(window)
             tones.append(Tone(float(at * resolution_hz), float(rms_v), channel, resolution_hz))
     tones.sort(key=lambda tone: -tone.rms_v)
-    return SilentRecord(tuple(tones), noise[0], noise[1], (float(edges[0]), float(edges[1])))
+    seen_hz = float(max(edges[0], FIRST_BIN * resolution_hz)), float(edges[1])  # alike of both channels
+    return SilentRecord(tuple(tones), noise[0], noise[1], seen_hz)
 
 
 def check_undriven(

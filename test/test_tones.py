@@ -59,6 +59,22 @@ def test_a_band_may_be_asked_for_and_must_hold_bins():
         silent_record(u, y, sample_rate_hz=RATE_HZ, band_hz=(200.0, 201.0))
 
 
+def test_a_short_record_says_from_where_on_it_shows_tones():
+    """50 Hz are the tenth bin of 0.2 s: among the first sixteen, in which none is looked for."""
+    rng = np.random.default_rng(5)
+    short = slice(0, int(0.2 * RATE_HZ))
+    u, y = white(rng, 1e-6), white(rng, 1e-6) + tones((50.0, 1e-3))
+    u, y = (x.reshape(1, -1)[:, short] for x in (u, y))
+    found = silent_record(u, y, sample_rate_hz=RATE_HZ)
+    assert found.tones == ()
+    assert found.band_hz == pytest.approx((80.0, RATE_HZ / 2))
+    assert "no tones from 80 to" in found.text()
+    given = silent_record(u, y, sample_rate_hz=RATE_HZ, band_hz=(200.0, 300.0))
+    assert given.band_hz == (200.0, 300.0)
+    with pytest.raises(ValueError, match=r"40..60 Hz hold 0 bins above the 80 Hz from which a record of"):
+        silent_record(u, y, sample_rate_hz=RATE_HZ, band_hz=(40.0, 60.0))
+
+
 def test_analyze_prints_what_a_silent_record_holds(tmp_path, capsys):
     rng = np.random.default_rng(4)
     u, y = white(rng, 1e-6), white(rng, 2e-6) + tones((249.9, 1e-4))
@@ -66,7 +82,8 @@ def test_analyze_prints_what_a_silent_record_holds(tmp_path, capsys):
     np.savez(path, u=u, y=y, sample_rate_hz=RATE_HZ, samples_per_period=SAMPLES)
     assert main(["analyze", str(path), "--silent"]) == 0
     out = capsys.readouterr().out
-    assert "sensor: noise 2e-06 V/sqrt(Hz), median from 0 to 2500 Hz" in out
+    lowest_hz = 16 * RATE_HZ / (PERIODS * SAMPLES)
+    assert f"sensor: noise 2e-06 V/sqrt(Hz), median from {lowest_hz:g} to 2500 Hz" in out
     assert "tone at 249.9 Hz: fits hum of 50 Hz, 0.0001 V rms in the sensor" in out
     for options in (["--json", tmp_path / "a.json"], ["--order", 4], ["--distortion"]):
         assert main(["analyze", str(path), "--silent", *map(str, options)]) != 0
