@@ -289,7 +289,7 @@ def _compare(options: argparse.Namespace) -> int:
     print(f"points of one tissue scatter by {std[0]:.3g} Hz and {std[1]:.2g} beside their noise")
     print(
         f"{int(found.differs.sum())} of {len(x)} points differ from the rest, at f0 {found.rest[0]:.3f} Hz, "
-        f"damping ratio {found.rest[1]:.5f}; {options.rate:.0%} of them are expected not to"
+        f"damping ratio {found.rest[1]:.5f}; {100 * options.rate:g} % of them or fewer are expected not to"
     )
     if pairs is not None:
         print(f"{int(pairs.sum()) // 2} of {len(x) * (len(x) - 1) // 2} pairs differ")

@@ -198,6 +198,8 @@ def test_points_of_a_map_are_compared(runs, tmp_path, capsys):
     compare = ["compare", runs[0], "--output", output]
     printed = called([*compare, "--library", library], capsys)
     assert "4 of 8 points differ from the rest" in printed
+    assert "; 5 % of them or fewer are expected not to" in printed
+    assert "; 0.4 % of them or fewer" in called([*compare, "--library", library, "--rate", "0.004"], capsys)
     assert "16 of 28 pairs differ" in printed
     assert "2 groups" in printed
     rows = list(csv.DictReader((tmp_path / "compared.csv").open()))
