@@ -350,7 +350,7 @@ def _pressed(
     for of in points:
         own = options.force_n is None and np.isfinite([of.force_n, of.force_std_n]).all()
         force = (of.force_n, of.force_std_n) if own else given
-        yield of.measurement_id, f"point {of.index} {of.label}".strip(), *force
+        yield of.measurement_id, f"point {of.index + 1} {of.label}".strip(), *force
     if not points:  # no run, or a reference of one
         if run is not None and wanted is None:
             raise ValueError(f"{options.record}: no point with a record")
