@@ -14,7 +14,7 @@ import shutil
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from enum import Enum
 from functools import lru_cache, partial
@@ -328,7 +328,14 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
         played.append((excitation, u, y))
     wanted, longest = periods or first.periods, max(len(u) for _, u, _ in played)
     if periods is None and 0 < longest < wanted:
-        notes.append(f"the measurement ended after {longest} of {wanted} periods")
+        ended = f"the measurement ended after {longest} of {wanted} periods"
+        if gaps := measurement.gaps:
+            realisation, block = gaps[0]
+            ended = (
+                f"{longest} of {wanted} consecutive periods are used: block {block + 1} of realisation "
+                f"{realisation + 1} is missing"
+            )
+        notes.append(ended)
         wanted = longest
     for excitation, u, _ in played:
         if len(u) < wanted:
@@ -346,6 +353,7 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
             f"measurement {key}: no complete realisation ({'; '.join(notes)}), expected one, or "
             "fewer periods requested"
         )
+    notes += _stated(measurement.records)
     recording = make_recording(
         np.stack([u for u, _ in channels]),  # (M, P, N)
         np.stack([y for _, y in channels]),
@@ -354,6 +362,19 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
         excited_harmonics=first.harmonics,
     )
     return replace(recording, notes=tuple(notes))
+
+
+def _stated(records: Sequence[Record]) -> Iterator[str]:
+    """What records say of themselves that a recording has no field for."""
+    for name in ("actuator", "sensor"):
+        if any(getattr(each, name).saturated for each in records):
+            yield f"{name} saturated"
+    delays_s = {each.channel_delay_s for each in records}
+    for delay_s in sorted(delay_s for delay_s in delays_s if np.isfinite(delay_s) and delay_s != 0):
+        yield (
+            f"the sensor channel is {delay_s:.6g} s behind the actuator channel, as the records state: it is "
+            "taken out only where channel_delay_s (--channel-delay) gives it"
+        )
 
 
 def write_stored(

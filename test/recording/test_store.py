@@ -16,6 +16,7 @@ import pytest
 from tactile_resonance.record import Channel, Contact, Origin, Record
 from tactile_resonance.recording.store import (
     RecordStore,
+    StoredMeasurement,
     read_measurement,
     read_stored,
     recording_of,
@@ -25,6 +26,13 @@ from tactile_resonance.recording.store import (
 sys.path.insert(0, str(Path(__file__).parent))
 import stores
 from stores import assert_same, read_store
+
+STATED = (
+    "actuator saturated",
+    "the sensor channel is 3.33333e-07 s behind the actuator channel, as the records state: it is taken out "
+    "only where channel_delay_s (--channel-delay) gives it",
+)
+"""By the records of `stores` of themselves."""
 
 
 def recording_in(folder, measurement_id=None, periods=None):
@@ -163,7 +171,7 @@ def test_recording_holds_the_complete_realisations(tmp_path):
     (folder,) = tmp_path.iterdir()
     whole = recording_in(tmp_path)
     assert whole.u.shape == whole.y.shape == (3, 4, stores.SAMPLES)
-    assert whole.notes == ()
+    assert whole.notes == STATED
     for found, record in zip(whole.u.reshape(12, -1), records, strict=True):
         np.testing.assert_array_equal(found, record.actuator.volts())
     np.testing.assert_array_equal(whole.excited_harmonics, stores.excitations()[0].harmonics)
@@ -171,11 +179,11 @@ def test_recording_holds_the_complete_realisations(tmp_path):
     (folder / "record-00001-0000002.npz").unlink()
     part = recording_in(tmp_path)
     np.testing.assert_array_equal(part.y, whole.y[[0, 2]])
-    assert part.notes == ("realisation 2 left out: 2 of 4 consecutive periods are there",)
+    assert part.notes == ("realisation 2 left out: 2 of 4 consecutive periods are there", *STATED)
     # the periods before the gap serve where so many are enough
     short = recording_in(tmp_path, periods=2)
     np.testing.assert_array_equal(short.y, whole.y[:, :2])
-    assert short.notes == ()
+    assert short.notes == STATED
 
 
 def test_recording_of_an_early_end(tmp_path):
@@ -189,11 +197,32 @@ def test_recording_of_an_early_end(tmp_path):
         recording_in(tmp_path, periods=4)
     recording = recording_in(tmp_path, periods=3)
     assert recording.u.shape == (1, 3, stores.SAMPLES)
-    assert recording.notes == ("1 of 3 realisations were played",)
+    assert recording.notes == ("1 of 3 realisations were played", *STATED)
     whole = recording_in(tmp_path)
     np.testing.assert_array_equal(whole.y, recording.y)
     ended = "the measurement ended after 3 of 4 periods"
-    assert whole.notes == (ended, "1 of 3 realisations were played")
+    assert whole.notes == (ended, "1 of 3 realisations were played", *STATED)
+
+
+def test_a_block_that_was_lost_is_no_early_end(tmp_path):
+    stores.write(RecordStore(tmp_path), 7, realisations=1, periods=4)
+    (folder,) = tmp_path.iterdir()
+    (folder / "record-00000-0000002.npz").unlink()
+    found = recording_in(tmp_path)
+    assert found.u.shape == (1, 2, stores.SAMPLES)
+    lost = "2 of 4 consecutive periods are used: block 3 of realisation 1 is missing"
+    assert found.notes == (lost, *STATED)
+
+
+def test_what_records_say_of_themselves_is_noted_and_nothing_else():
+    excitation = stores.excitations(realisations=1, periods=1)[0]
+    record = stores.record(excitation, 0)
+    plain = replace(record, actuator=replace(record.actuator, saturated=False), channel_delay_s=0.0)
+    for channel_delay_s in (0.0, np.nan):
+        of = StoredMeasurement.of(7, [excitation], [replace(plain, channel_delay_s=channel_delay_s)], [])
+        assert recording_of(of).notes == ()
+    sensed = replace(plain, sensor=replace(plain.sensor, saturated=True))
+    assert recording_of(StoredMeasurement.of(7, [excitation], [sensed], [])).notes == ("sensor saturated",)
 
 
 def test_one_of_several_measurements_must_be_chosen(tmp_path):
