@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -241,6 +241,11 @@ def _cut(
     lengths = {stop - start for start, stop in pairs}
     if len(lengths) != 1:
         raise ValueError(f"segments: lengths {sorted(lengths)}, expected one length for all")
+    for (start, stop), (following, end) in pairwise(sorted(pairs)):
+        if following < stop:  # the noise of both would be taken for independent
+            raise ValueError(
+                f"segments: {start}:{stop} and {following}:{end} share samples, expected each sample once"
+            )
     return np.stack([samples[start:stop] for start, stop in pairs])[:, None]
 
 

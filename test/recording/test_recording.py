@@ -62,6 +62,7 @@ def test_single_precision_is_not_copied():
         ({"periods": 9}, r"periods: 9, accepted is 1\.\.4"),
         ({"segments": [(0, 30)]}, "segments: 0:30"),
         ({"segments": [(0, 6), (6, 18)]}, r"segments: lengths \[6, 12\]"),
+        ({"segments": [(8, 20), (0, 12)]}, "segments: 0:12 and 8:20 share samples, expected each sample once"),
         ({"y": Y[:-1]}, r"y: shape \(23,\), expected that of u"),
         ({"y": np.where(np.arange(24) == 3, np.nan, Y)}, "y: 1 samples are NaN or infinite"),
         ({"u": np.where(np.arange(24) == 3, np.inf, U)}, "u: 1 samples are NaN or infinite"),
