@@ -127,6 +127,8 @@ def test_all_points_of_a_run(bench, run, tmp_path, capsys):
     assert main(["analyze", str(run), "--calibration", sensor, "--json", str(output)]) == 0
     text = capsys.readouterr().out
     assert "sensor in air: as calibrated" in text
+    named = [line.split()[1].rstrip(":") for line in text.splitlines() if line.startswith("point ")]
+    assert named == ["1", "2"]
     found = json.loads(output.read_text())
     assert list(found) == ["20", "21"]
     for content, name in zip(found.values(), TISSUES, strict=True):
