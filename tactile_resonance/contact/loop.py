@@ -152,7 +152,7 @@ class ContactLoop:
         except ForceError as error:
             fault = fault or error
         else:
-            # those of a cycle without a state of the arm are told, too, as from where the tip was last
+            # without a state of the arm in this cycle, wrenches are referred to its last known pose
             pose = self._pose = arm or self._pose
             if felt and pose is not None:
                 turn = turn_from_vector(pose.rotation_rad)

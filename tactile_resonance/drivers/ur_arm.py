@@ -195,7 +195,7 @@ class UrArm:
         if self.led is not None:
             self.led.close()
         if self._asked is not None:
-            self._asked.interrupt()  # whoever waits in another thread is told
+            self._asked.interrupt()  # a wait in another thread ends with `ClockLostError`
             self._asked.close()
             self._asked, self.clock = None, WallClock()
 

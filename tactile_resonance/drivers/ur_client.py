@@ -42,7 +42,7 @@ from tactile_resonance.drivers.ur_exchange import (
 from tactile_resonance.drivers.ur_session import Session
 
 LONGEST_MESSAGE = 8192
-# Characters of an error of the library that are told.
+# Characters of an error of the library that are sent to the owner.
 MOST_TOLD = 1000
 # No command is given to a robot of which the owner has seen nothing for so long.
 HEALTHY_S = 0.1

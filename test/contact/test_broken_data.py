@@ -130,8 +130,8 @@ def test_command_that_the_driver_refuses_ends_the_contact_with_its_reason():
     assert made.loop.retract().retracted
 
 
-def test_forces_are_told_while_no_state_of_the_arm_comes():
-    """Who looks on sees them all the more then: a supervisor may have to act."""
+def test_forces_are_reported_while_no_state_of_the_arm_comes():
+    """A supervisor may have to act on them."""
     made, told = contact(SOFT), []
     made.loop = ContactLoop(
         made.bench.arm, made.bench.cell, made.bench.clock, made.controller, told.append
@@ -150,7 +150,7 @@ def test_forces_are_told_while_no_state_of_the_arm_comes():
     assert {cycle.arm for cycle in told} == {None}
     forces = [wrench.force_n[2] for cycle in told for wrench in cycle.wrenches]
     assert len(forces) >= 10
-    # the arm is told to stop, and stands: the force stays what it was, and so does its zero
+    # the arm has been stopped and stands, so force and zero stay as they were
     zero_n = told[0].bias_n[2]
     assert np.mean(forces) - zero_n == pytest.approx(FORCE_N, rel=0.2)
 

@@ -59,9 +59,14 @@ def record(periods, f0_drift_hz_per_s, damping_drift_per_s, damping=DAMPING, sha
 
 def fits(periods, f0_drift_hz_per_s=0.0, damping_drift_per_s=0.0, structure=BARE, shape=steady):
     noise = 5e-3
-    u, y = record(periods, f0_drift_hz_per_s, damping_drift_per_s, shape=shape)
+    return repeated(record(periods, f0_drift_hz_per_s, damping_drift_per_s, shape=shape), noise, structure)
+
+
+def repeated(samples, noise, structure=BARE, runs=RUNS):
+    """Poles of a record without noise, as often with noise of its own."""
+    u, y = samples
     rng = np.random.default_rng(2)
-    for _ in range(RUNS):
+    for _ in range(runs):
         yield identify_poles_from_records(
             u + noise / 10 * rng.standard_normal(u.shape),
             y + noise * rng.standard_normal(y.shape),
@@ -139,17 +144,7 @@ def test_a_constant_mode_does_not_change(periods):
 
 
 def from_rest(periods, f0_drift_hz_per_s, damping, noise=2e-3, runs=12):
-    u, y = record(periods, f0_drift_hz_per_s, 0.0, damping)
-    rng = np.random.default_rng(2)
-    for _ in range(runs):
-        yield identify_poles_from_records(
-            u + noise / 10 * rng.standard_normal(u.shape),
-            y + noise * rng.standard_normal(y.shape),
-            sample_rate_hz=RATE_HZ,
-            harmonics=HARMONICS,
-            band_hz=(200.0, 300.0),
-            structure=BARE,
-        )
+    return repeated(record(periods, f0_drift_hz_per_s, 0.0, damping), noise, runs=runs)
 
 
 @pytest.mark.parametrize(("drift", "damping"), [(3.0, 0.02), (1.0, 0.01), (0.3, 0.005)])

@@ -64,7 +64,7 @@ def test_tests_take_what_they_hold_or_longer_at_the_points_they_are_asked_for():
     shortest_s, longest_s = ([getattr(plan, name) for plan in plans] for name in ("shortest_s", "longest_s"))
     assert np.diff(shortest_s) == pytest.approx(2 * 10.0)
     assert np.diff(longest_s) == pytest.approx(2 * relaxation.longest_s)
-    # of a scan that has time for that no limit is told
+    # no limit is reported for a scan that has enough time
     limits = TimeLimits(scan_s=shortest_s[1] + 1.0)
     assert "limit" not in told(replace(asked, protocols=(relaxation,), time_limits=limits))
 

@@ -74,7 +74,7 @@ class Program(CommandLoop):
             self.tell_asynchronous(begins=False)
 
     def _done(self, name: str, work: Thread) -> Thread:
-        """Do a motion; where integer 1 says so as a thread, whose begin and end the client is told."""
+        """Execute a motion; in a thread if integer 1 is set, whose begin and end are reported to the client."""
         if self.integer(1) == 1:
             self.run(name, self._told(work))
         else:
