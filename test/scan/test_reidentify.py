@@ -4,6 +4,7 @@
 import array
 import contextlib
 import csv
+import errno
 import fcntl
 import json
 import os
@@ -273,6 +274,19 @@ def test_bins_of_another_format_are_made_again(tmp_path, capsys):
     capsys.readouterr()
     assert main(["reidentify", str(run)]) == 0
     assert "bins of run: 1 of 1" in capsys.readouterr().out
+
+
+def test_bins_that_cannot_be_read_are_not_taken_for_damaged(tmp_path, monkeypatch):
+    run = make_run(tmp_path / "run", [measurement(100)])
+    (run / kept_bins.NAME).write_bytes(b"kept")
+
+    def denied(path):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(np, "load", denied)
+    with pytest.raises(PermissionError, match="bins.npz"):
+        kept_bins.kept_bins(run, (210.0, 290.0))
+    assert (run / kept_bins.NAME).read_bytes() == b"kept"
 
 
 def test_an_interrupted_one_leaves_what_was_there(runs, tmp_path):

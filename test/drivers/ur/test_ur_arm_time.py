@@ -26,7 +26,7 @@ from arms import (
     tick,
 )
 
-from tactile_resonance.clock import PORT, Demand, SimulatedClock
+from tactile_resonance.clock import PORT, ClockLostError, Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import NOTHING, SIZE, SPEED, Exchange, UrCommand
@@ -288,6 +288,26 @@ def test_a_loop_that_dies_while_it_leads_holds_nothing(robot, start_arm, module_
     arm.led.bench.close()
     arm._asked.close()
     robot.until(runtime_state="STOPPED")  # by its watchdog: time goes on
+
+
+def test_a_wait_in_another_thread_ends_as_the_arm_is_closed(robot, start_arm, module_arm):
+    module_arm.close()
+    arm, lost = start_arm(robot.host), threading.Event()
+    arm.connect()
+    clock = arm.clock
+
+    def wait():
+        try:
+            clock.wait_until(clock.now_ns() + 10**15)
+        except ClockLostError:
+            lost.set()
+
+    waiting = threading.Thread(target=wait, daemon=True)
+    waiting.start()
+    time.sleep(0.2)
+    assert waiting.is_alive()
+    arm.close()
+    assert lost.wait(PATIENCE_S)
 
 
 def test_without_a_bench_the_link_is_lost(start_arm):
