@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session does not begin among the nodes of another one, and does not wait for a scan_node that hangs."""
+"""How a session begins and ends: not among the nodes of another one, and with how to go on."""
 
+import contextlib
+import errno
 from types import SimpleNamespace
 
 import pytest
@@ -49,6 +51,27 @@ def test_a_domain_with_nodes_of_another_session_is_refused(
         else:
             require_own_domain()
         node.destroy_node()
+
+
+def test_a_terminal_that_was_closed_is_told_how_to_go_on_where_a_run_was_begun(monkeypatch, tmp_path):
+    run = tmp_path / "run"
+
+    def scan(*_):
+        run.mkdir()
+        (run / "run.json").touch()
+        raise OSError(errno.EIO, "Input/output error")  # of a line to the terminal
+
+    nodes = SimpleNamespace(bring_up=lambda *_, **__: None)
+    monkeypatch.setattr(bench_scan, "NodeProcesses", lambda _: contextlib.nullcontext(nodes))
+    quiet = contextlib.nullcontext(lambda: None)
+    monkeypatch.setattr(bench_scan, "noting_signals", lambda: quiet)  # the tests keep their handlers
+    monkeypatch.setattr(bench_scan, "_scan", scan)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("TACTILE_RESONANCE_COMMAND", "tactile_resonance")
+    job = bench_scan.Job(share_path("config/scenes/demo.yaml"), run, "127.0.0.1")
+    with pytest.raises(OSError, match=rf"error; tactile_resonance resume {run} goes on"):
+        bench_scan.run_job(job)
 
 
 @pytest.mark.parametrize(
