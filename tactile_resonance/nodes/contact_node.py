@@ -60,7 +60,7 @@ PARAMETERS = (
         "First contact is detected by poles too, against those in air: the rest of the approach is slow then. "
         "Poles come once a block, so the approach must be slow already: contact.approach_speed_m_s of 2.5e-4 "
         "for blocks of 0.4 s, with limits.approach_s of 20 s or more, and the client has to ask for "
-        "measurements of one or two periods all the time.",
+        "measurements of one or two periods all the time; eight of them in air come first.",
     ),
     Fixed("touch_false_alarm", 1e-6, "Probability of a false alarm of one block [-].", 1e-12, 0.1),
     Fixed("frame_id", "tip", "Frame of the sensor's tip."),

@@ -50,18 +50,47 @@ def test_poles_in_air_are_chi_squared_and_a_contact_is_told():
     assert touch.touched(contact, COVARIANCE)
 
 
+@pytest.mark.parametrize("along", [0.0, 1.0])
+def test_stated_probability_holds_where_air_scatters_by_more_than_stated(along):
+    """Along both axes of the covariance, or along one: no more false alarms than stated from few blocks."""
+    rng, runs, p, blocks = np.random.default_rng(3), 2000, 0.01, 3
+    root = 30 * np.linalg.cholesky(COVARIANCE) * [1.0, along]
+    alarms = 0
+    for _ in range(runs):
+        touch = PolesTouch(p, blocks)
+        for _ in range(blocks):
+            touch.add_air(AIR + root @ rng.standard_normal(2), COVARIANCE)
+        alarms += touch.touched(AIR + root @ rng.standard_normal(2), COVARIANCE)
+    low, high = binom.interval(0.9999, runs, p)
+    assert alarms <= high
+    if not along:  # the bound is reached there
+        assert alarms >= low
+
+
+def test_contact_is_told_after_the_blocks_in_air_that_are_the_default():
+    rng, told, runs = np.random.default_rng(4), 0, 300
+    root = np.linalg.cholesky(COVARIANCE)
+    for _ in range(runs):
+        touch = PolesTouch()
+        while not touch.ready:
+            touch.add_air(AIR + root @ rng.standard_normal(2), COVARIANCE)
+        # a tenth of the change that 1 cN on 10 % gelatine makes
+        told += touch.touched(AIR + 0.1 * np.array([7.23, 0.0217]), COVARIANCE)
+    assert told == runs
+
+
 def test_reference_that_scatters_more_than_stated_raises_the_threshold():
     steady, warming = PolesTouch(), PolesTouch()
-    for n in range(3):
+    for n in range(8):
         steady.add_air(AIR, COVARIANCE)
         warming.add_air(AIR + [0.1 * n, 0.0], COVARIANCE)
-    next_one = AIR + [0.3, 0.0]
+    next_one = AIR + [0.8, 0.0]
     assert steady.touched(next_one, COVARIANCE)
     assert not warming.touched(next_one, COVARIANCE)
 
 
 def test_what_cannot_be_judged_is_refused():
-    with pytest.raises(ValueError, match="3 blocks in air first"):
+    with pytest.raises(ValueError, match="8 blocks in air first"):
         PolesTouch().statistic(AIR, COVARIANCE)
     with pytest.raises(ValueError, match="positive definite"):
         PolesTouch().add_air(AIR, np.zeros((2, 2)))

@@ -227,7 +227,7 @@ def poles(pole, middle_ns, *, final=True, covariance=True):
 class Hearing:
     """A `TouchFromPoles` with a clock set by the test."""
 
-    def __init__(self, references=3):
+    def __init__(self, references=8):
         self.told, self.now_ns = 0, UP_NS + 2 * SECOND_NS
         self.rng = np.random.default_rng(2)
         self.touch = TouchFromPoles(1e-6, UP_NS)
@@ -259,8 +259,8 @@ def test_poles_that_change_in_an_approach_tell_the_touch():
     assert listener.told == 1
 
 
-def test_without_three_measurements_in_air_nothing_is_told():
-    listener = Hearing(references=2)
+def test_without_eight_measurements_in_air_nothing_is_told():
+    listener = Hearing(references=7)
     # what it holds is part of what the next poles of the same measurement say again
     listener.hear(AIR, State.IDLE, final=False)
     assert not listener.hear(GELATINE, State.APPROACH)
@@ -291,7 +291,7 @@ def test_measurement_that_began_before_all_that_is_known_is_no_reference():
     listener = Hearing(references=0)
     # whether the tip was in air then nobody can tell
     listener.hear(AIR, State.IDLE, length_s=1.5, passed=True)
-    for _ in range(2):
+    for _ in range(7):
         listener.hear(AIR, State.IDLE)
     listener.stay(State.APPROACH, 1.5)
     assert not listener.hear(GELATINE, State.APPROACH)
@@ -300,4 +300,4 @@ def test_measurement_that_began_before_all_that_is_known_is_no_reference():
 
 def test_poles_without_covariance_are_said_to_be_of_no_use():
     with pytest.raises(ValueError, match="covariance: unknown"):
-        Hearing(references=3).hear(AIR, State.APPROACH, covariance=False)
+        Hearing().hear(AIR, State.APPROACH, covariance=False)
