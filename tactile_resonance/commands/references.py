@@ -398,7 +398,8 @@ def _spread_lines(spread: TissueSpread) -> list[str]:
         )
     if spread.degrees_of_freedom < FEW:
         lines.append(
-            "  warning: few degrees of freedom make a wide class: more preparations, or --pool"
+            "  warning: few degrees of freedom make a wide class, and calls too sure where another is near: "
+            "more preparations, or --pool"
         )
     return lines
 

@@ -110,7 +110,7 @@ def test_a_library_of_runs_serves_a_scene(runs, tmp_path, capsys):
 
 
 def test_the_smallest_step_names_a_source_that_is_not_in_it(runs, tmp_path, capsys):
-    build = ["--labels", "scene", "--nominal", NOMINAL, "--output", tmp_path / "library.yaml"]
+    build = ["--labels", "scene", "--nominal", NOMINAL, "--pool", "--output", tmp_path / "library.yaml"]
     printed = called(["references", "build", runs[0], *build], capsys)
     assert "% with all sources but preparation, not determined, " in printed
     printed = called(["references", "build", *runs[:3], *build], capsys)
@@ -159,6 +159,7 @@ def test_one_preparation_is_declared(runs, tmp_path, capsys):
         "scene",
         "--nominal",
         NOMINAL,
+        "--pool",
         "--output",
         library,
     ]

@@ -139,14 +139,21 @@ def test_degrees_of_freedom_of_single_measurements_are_those_of_their_scatter():
     np.testing.assert_allclose(spread.covariance, 10 / 9 * np.cov(points.estimate.T))
 
 
-def test_two_points_are_no_class_whatever_rounding_makes_of_their_one_degree_of_freedom():
+@pytest.mark.parametrize("preparations", [3, 4])
+def test_four_points_are_a_class_as_those_of_a_scene_are(preparations):
+    """Whatever rounding makes of the degrees of freedom of the fourth."""
     rng = np.random.default_rng(9)
     for _ in range(20):
-        (spread,) = spreads_of(drawn(rng, [(1,), (1,)]))
-        assert spread.degrees_of_freedom == pytest.approx(1)
-        assert not spread.usable
-        with pytest.raises(ValueError, match="degrees_of_freedom: got .* accepted is more than 1"):
-            spread.as_class()
+        (spread,) = spreads_of(drawn(rng, [(1,)] * preparations, noise=np.zeros((2, 2))))
+        assert spread.degrees_of_freedom == pytest.approx(preparations - 1)
+        assert spread.usable == (preparations == 4)
+
+
+def test_two_preparations_are_no_class_however_alike_their_positions():
+    (spread,) = spreads_of(drawn(np.random.default_rng(10), [(1,) * 6] * 2))
+    assert 1 < spread.degrees_of_freedom < 3
+    with pytest.raises(ValueError, match="gel: degrees_of_freedom: .*3 or more: more prep"):
+        spread.as_class()
 
 
 def test_refusals():
@@ -156,7 +163,7 @@ def test_refusals():
     with pytest.raises(ValueError, match="gel: degrees_of_freedom: got 0"):
         one.as_class()
     (two,) = spreads_of(drawn(np.random.default_rng(8), [(1,), (1,)], noise=np.zeros((2, 2))))
-    with pytest.raises(ValueError, match="gel: degrees_of_freedom: .*more than 1: more prep"):
+    with pytest.raises(ValueError, match="gel: degrees_of_freedom: .*3 or more: more prep"):
         two.as_class()
     with pytest.raises(ValueError, match="points: got 0"):
         spreads_of(points.where(np.zeros(1, bool)))
