@@ -95,6 +95,7 @@ class ScanRunner:
         self._disturbed: defaultdict[int, Disturbances] = defaultdict(Disturbances)
         self._air: MainMode | None = None
         self._left_s = NAN  # when the tip was free after the newest point
+        self._again: ScanPoint | None = None  # attempted last, and nothing was kept of it
 
     def run(self) -> Summary:
         """Finish every point that is not; references, of free air and silent, are taken before and after."""
@@ -135,15 +136,18 @@ class ScanRunner:
     def _next(self) -> ScanPoint | None:
         """The point to touch next; waits while the scan is paused or a node is away.
 
-        The first that is not finished; an adaptive scan chooses and appends one where all are.
+        That whose last attempt was discarded, although an earlier one may have finished it; else the first that
+        is not finished; an adaptive scan chooses and appends one where all are.
         """
         self._wait()
-        if (point := self._run.next_point) is None:
+        again, self._again = self._again, None
+        if (point := again or self._run.next_point) is None:
             content = self._run.content
             chosen = self._plan.next_point(content.points, content.latest)
             point = None if chosen is None else self._run.append(chosen)
         request = self._controls.take()
-        if request is Request.REPEAT and (content := self._run.content).results:
+        repeats = request is Request.REPEAT and again is None
+        if repeats and (content := self._run.content).results:
             latest = max(content.results, key=lambda result: result.time_ns)
             return content.points[latest.index]
         if request is Request.SKIP and point is not None:
@@ -235,6 +239,7 @@ class ScanRunner:
             if outcome is PointOutcome.DISCARDED:
                 self._hands.retract()
                 self._discard(point, recording, reason)
+                self._again = point
                 return
             self._say(point, Phase.RETRACT)
             left_n = self._hands.retract()

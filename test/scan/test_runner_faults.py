@@ -75,6 +75,37 @@ def test_a_point_that_is_disturbed_comes_again_and_fails_in_the_end(tmp_path):
     assert run.latest[1].repeats == ATTEMPTS - 1
 
 
+@pytest.mark.parametrize("asked_again", [False, True])
+def test_a_finished_point_whose_repetition_is_disturbed_or_left_is_repeated_all_the_same(
+    tmp_path, asked_again
+):
+    controls = Controls()
+
+    class Repeated(Bench):
+        @property
+        def touched(self):
+            return [entry[1] for entry in self.log if entry[0] == "touch"]
+
+        def missing(self):
+            if self.touched == [0, 1]:  # looked at once, before the next point
+                controls.ask(Request.REPEAT)
+            return None
+
+        def measure(self, design, label, seed, enough, recording, check):
+            if self.touched == [0, 1, 1]:
+                if not asked_again:
+                    raise PointDisturbed("contact: force_stale: 11 ms", "force_stale")
+                controls.ask(Request.REPEAT)
+                check()
+            return super().measure(design, label, seed, enough, recording, check)
+
+    bench = Repeated()
+    summary, run, _ = scan(tmp_path / "run", scene(), bench, controls)
+    assert summary.complete
+    assert bench.touched == [0, 1, 1, 1, 2, 3]
+    assert [(r.index, r.attempt) for r in run.results] == [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)]
+
+
 def test_a_reference_that_is_disturbed_comes_again(tmp_path):
     @dataclass
     class Disturbed(Bench):
