@@ -25,7 +25,7 @@ from unique_identifier_msgs.msg import UUID
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.msg import PointResult
 from tactile_resonance.nodes.goals import ASK_AGAIN_S, GoalClient, Steps, answer_to, offer
-from tactile_resonance.nodes.running import RESULTS, STEADY
+from tactile_resonance.nodes.running import NEW_POINT_RESULTS, STEADY
 
 TICK_S = 0.1
 
@@ -184,8 +184,9 @@ class TactileClient:
             name: node.create_client(Trigger, f"{prefix}scan/{name}", callback_group=group)
             for name in ("pause", "resume", "skip_point", "repeat_point", "rejection")
         }
+        topic, qos = f"{prefix}point_result", NEW_POINT_RESULTS
         self._points = node.create_subscription(
-            PointResult, f"{prefix}point_result", self._on_point, RESULTS, callback_group=group
+            PointResult, topic, self._on_point, qos, callback_group=group
         )
         self._timer = node.create_timer(TICK_S, self._on_tick, callback_group=group, clock=STEADY)
         self._timer.cancel()

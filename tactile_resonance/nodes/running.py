@@ -49,6 +49,8 @@ TRUTHS = _qos(64, latched=True)
 POLES = _qos(1024, latched=True)
 # What became of the points: late readers get all of a scan.
 POINT_RESULTS = _qos(4096, latched=True)
+# The same from now on: of a run that is resumed all come at once.
+NEW_POINT_RESULTS = _qos(POINT_RESULTS.depth)
 # Poses and wrenches: the newest counts.
 STREAM = _qos(5, reliable=False)
 NEWEST = _qos(1, reliable=False)

@@ -23,7 +23,7 @@ from tactile_resonance.msg import PointResult
 from tactile_resonance import client as client_module
 from tactile_resonance.client import CalibrationOutcome, Ending, ScanOutcome, TactileClient
 from tactile_resonance.nodes import goals, scan_node
-from tactile_resonance.nodes.running import POLES, initialised
+from tactile_resonance.nodes.running import POINT_RESULTS, POLES, initialised
 from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.run_content import checksum_of
@@ -220,6 +220,21 @@ def test_results_of_points_come_while_a_scan_is_under_way(stack):
     stack.ended(future)
     publisher.publish(PointResult(label="of a scan after"))
     assert not spin_until(stack, lambda: len(points) > len(labels), 0.5)
+
+
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_no_result_of_a_long_run_that_is_resumed_is_lost(stack):
+    """scan_node publishes all of them at once, before a client takes the first."""
+    stack.activate()
+    publisher, indices = stack.user.create_publisher(PointResult, "point_result", POINT_RESULTS), []
+    spin_until(stack, lambda: publisher.get_subscription_count(), 10.0)
+    future = stack.begin([], on_point=lambda point: indices.append(point.index))
+    for index in range(1000):
+        publisher.publish(PointResult(index=index))
+    stack.until(lambda: indices and indices[-1] == 999)
+    assert indices == list(range(1000))
+    stack.client.cancel()
+    stack.ended(future)
 
 
 def test_an_outcome_can_be_awaited(stack):
