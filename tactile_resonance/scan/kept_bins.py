@@ -161,7 +161,7 @@ def bins_of_point(
 ) -> tuple[BinsKind, npt.NDArray] | str:
     """Kind and row (1,) of a point of a run in a band, from its records; why there is none as text."""
     run, result, band_hz = job
-    name = f"point {result.index}"
+    name = f"point {result.index + 1}"
     try:
         recording = recording_of_point(run, result)
         record, harmonics = Spectrum.of(recording.u, recording.y), recording.excited_harmonics

@@ -110,7 +110,7 @@ def run_names(runs: Sequence[RunContent]) -> list[str]:
             if result.kind is PointKind.TISSUE and not result.failed:
                 key = (*result.estimate.tolist(), *result.std.tolist())
                 first = seen.setdefault(key, name)
-                same = f"point {result.index} of {name} as in {first}"
+                same = f"point {result.index + 1} of {name} as in {first}"
                 require(first == name, "runs", same, "no copy, and none of the same seed")
     return names
 

@@ -282,7 +282,7 @@ def test_refusals(tmp_path, capsys):
         labelled_frfs([contents[0], contents[0]], label_of)
     shutil.copytree(run, tmp_path / "copy")
     copied = [contents[0], read_run(tmp_path / "copy")]
-    with pytest.raises(ValueError, match="runs: got 'point 0 of copy as in one'; accepted is no copy"):
+    with pytest.raises(ValueError, match="runs: got 'point 1 of copy as in one'; accepted is no copy"):
         reference_points(copied, label_of, None)
     compare = ["compare", run, "--output", tmp_path / "x"]
     assert "runs: got ['one', 'one']" in called(["compare", run, *compare[1:]], capsys, status=1)

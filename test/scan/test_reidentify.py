@@ -114,7 +114,7 @@ def test_the_poles_are_those_of_analyze(runs, tmp_path, capsys, order):
     rows = table(tmp_path / "again.csv")
     assert [int(row["index"]) for row in rows] == [0, 1, 3, 4, 2]  # by the kind of their records
     assert "left out" in printed
-    assert "point 5: done, nothing was measured" in printed
+    assert "point 6: done, nothing was measured" in printed
     statuses = [row["poles_status"] for row in rows]
     for status in set(statuses):
         assert f"{status}: {statuses.count(status)}\n" in printed
