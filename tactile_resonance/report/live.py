@@ -22,6 +22,8 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from tactile_resonance.fields import known
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.page import (
@@ -119,7 +121,11 @@ class LiveRun:
             before = self._results.get(result.index)
             if before is not None and before.time_ns == result.time_ns:
                 return  # published again
-            another = before is not None and before.attempt >= result.attempt
+            # in a run the attempts at a point are numbered, and made at one place
+            another = before is not None and not (
+                before.attempt < result.attempt
+                and np.array_equal(before.position_m, result.position_m, equal_nan=True)
+            )
             if another:
                 self._begin()
             self._results[result.index], self._newest = result, result.index

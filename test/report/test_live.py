@@ -78,11 +78,13 @@ def test_what_does_not_count_is_not_shown():
     assert point["f0_hz"] == 260.0
 
 
-def test_another_scan_begins_anew():
+@pytest.mark.parametrize("first", [{}, {"attempt": 1, "x_m": 5e-3}])
+def test_another_scan_begins_anew(first):
+    """Its first attempt may be a second one: a file of the first may be damaged. Its place tells it then."""
     live = LiveRun(heard := Heard())
     for index in range(3):
         live.take_result(result(index), None)
-    live.take_result(result(0, time_ns=10**12), None)
+    live.take_result(result(0, time_ns=10**12, **first), None)
     (run,) = heard.of("run")
     assert [p["index"] for p in run["bands"][0]["points"]] == [0]
 
