@@ -50,19 +50,23 @@ def run(options: argparse.Namespace) -> int:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     live = LiveRun(lambda name, data: server.publish(name, data))
     server = LiveServer(options.port, live.snapshot)
-    ended = threading.Event()
+    ended, failed = threading.Event(), list[Exception]()
 
     def tick() -> None:
-        while not ended.wait(EACH_S):
-            if server.readers:
-                live.tick()
+        try:
+            while not ended.wait(EACH_S):
+                if server.readers:
+                    live.tick()
+        except Exception as error:  # raised again below: a page that stands still would seem to be live
+            failed.append(error)
 
     with server, LiveListener(live, options.namespace) as listener:
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         print(f"{server.url} shows the nodes of ROS_DOMAIN_ID={domain}; Ctrl-C ends it", flush=True)
         threading.Thread(target=tick, daemon=True).start()
         try:
-            while True:
+            while not failed:
                 listener.spin(1.0)
+            raise failed[0]
         finally:
             ended.set()

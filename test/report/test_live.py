@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a scan under way: what is heard comes out as events, to this machine alone; nothing goes in."""
 
+import argparse
+import contextlib
 import http.client
 import json
 import math
@@ -149,6 +151,29 @@ def test_the_map_between_points_costs_a_bounded_share_of_the_time():
     live.tick()
     (event,) = heard.of("surface")
     assert event["surface"] is None
+
+
+def test_a_page_that_cannot_go_on_ends_its_command(monkeypatch):
+    pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
+    from tactile_resonance.commands import live as command
+    from tactile_resonance.nodes import client
+
+    class Nobody(contextlib.nullcontext):
+        def __init__(self, live, namespace):
+            super().__init__(self)
+
+        def spin(self, seconds):
+            time.sleep(0.01)
+
+    def broken(live):
+        raise ZeroDivisionError("of a map")
+
+    monkeypatch.setattr(client, "LiveListener", Nobody)
+    monkeypatch.setattr(LiveServer, "readers", 1)
+    monkeypatch.setattr(LiveRun, "tick", broken)
+    monkeypatch.setattr(command.signal, "signal", lambda number, handler: None)
+    with pytest.raises(ZeroDivisionError, match="of a map"):
+        command.run(argparse.Namespace(port=0, namespace=""))
 
 
 def test_details_of_a_long_scan_are_bounded():
