@@ -68,6 +68,7 @@ class TopicWrench:
         self._fault: ForceError | None = None
         self._silent_from_s = 0.0
         self._last_stamp_ns = 0
+        self._frame_id: str | None = None  # of the first wrench
         self._listening = False
         self._subscription = None
 
@@ -81,7 +82,7 @@ class TopicWrench:
         self._listening = False
         self._samples.clear()
         self._checks.restart()
-        self._fault, self._last_stamp_ns = None, 0
+        self._fault, self._last_stamp_ns, self._frame_id = None, 0, None
         self._silent_from_s = self._now_s + FIRST_WITHIN_S
         self._listening = True
         if self._subscription is None:
@@ -126,6 +127,7 @@ class TopicWrench:
         stamp_ns = time_from_message(message.header.stamp)
         try:
             self._check_stamp(stamp_ns)
+            self._check_frame(message.header.frame_id)
             overload = self._checks.check(wrench)
         except ForceError as error:
             self._fault = error
@@ -153,3 +155,11 @@ class TopicWrench:
             raise ForceError(ForceFault.INVALID, text)
         if stamp_ns <= self._last_stamp_ns:
             raise ForceError(ForceFault.INVALID, f"topic {topic}: time stamps do not increase")
+
+    def _check_frame(self, frame_id: str) -> None:
+        """Two sensors that publish on one topic would count as one."""
+        if self._frame_id is None:
+            self._frame_id = frame_id
+        if frame_id != self._frame_id:
+            text = f"wrenches in {self._frame_id!r} and in {frame_id!r}: do two sensors publish it?"
+            raise ForceError(ForceFault.INVALID, f"topic {self._config.topic}: {text}")

@@ -65,14 +65,14 @@ class Link:
         self.source.close()
         self.node.destroy_node()
 
-    def send(self, count=1, *, force_n=0.01, noise_n=1e-3, stamp_ns=None, later_ns=2_000_000):
+    def send(self, count=1, *, force_n=0.01, noise_n=1e-3, stamp_ns=None, later_ns=2_000_000, frame=""):
         """Send wrenches, the clock going on before each; returns what was sent."""
         sent = []
         for _ in range(count):
             self.now_ns += later_ns
             message = WrenchStamped()
             stamp = self.now_ns + AHEAD_NS if stamp_ns is None else stamp_ns
-            message.header.stamp = time_message(stamp)
+            message.header.stamp, message.header.frame_id = time_message(stamp), frame
             noise = noise_n * self.rng.standard_normal(3)
             force, torque = message.wrench.force, message.wrench.torque
             force.x, force.y, force.z = *noise[:2], force_n + noise[2]
@@ -131,6 +131,17 @@ def test_faults_are_named_stay_and_end_with_a_new_start(link, count, how, fault,
         link.send(count - 1, **how)  # what was before does not count
     link.send(5)
     assert len(link.source.read()) == count - 1 + 5
+
+
+def test_two_sensors_on_one_topic_are_not_taken_for_one(link):
+    link.send(3, frame="cell")
+    link.send(frame="wrist", force_n=0.03)
+    with pytest.raises(ForceError, match="in 'cell' and in 'wrist': do two sensors") as caught:
+        link.source.read()
+    assert caught.value.fault is ForceFault.INVALID
+    link.source.start()
+    link.send(3, frame="wrist")
+    assert len(link.source.read()) == 3
 
 
 @pytest.mark.parametrize(
