@@ -90,13 +90,17 @@ class Clock(Protocol):
         return ros_ns
 
 
+ROS_STEP_NS = 5_000_000
+"""Beyond it ROS time was set, against the monotonic clock [ns]; where it is only corrected, both go alike."""
+
+
 class WallClock:
-    """The machine's monotonic clock, related to ROS time once, when it is made."""
+    """The machine's monotonic clock, related to ROS time when it is made, and again where that was set."""
 
     simulated = False
 
     def __init__(self) -> None:
-        self._ros_ahead_ns = time.time_ns() - time.monotonic_ns()
+        self._ros_ahead_ns = _ros_ahead_ns()
 
     def now_ns(self) -> int:
         """Time now [ns]."""
@@ -110,11 +114,28 @@ class WallClock:
 
     def ros_ns(self, time_ns: int) -> int:
         """UNIX time [ns]."""
-        return time_ns + self._ros_ahead_ns
+        return time_ns + self._ahead_ns
 
     def own_ns(self, ros_ns: int) -> int:
         """Time of this clock [ns] at a UNIX time [ns]."""
-        return ros_ns - self._ros_ahead_ns
+        return ros_ns - self._ahead_ns
+
+    @property
+    def _ahead_ns(self) -> int:
+        if abs(time.time_ns() - time.monotonic_ns() - self._ros_ahead_ns) > ROS_STEP_NS:
+            ahead_ns = _ros_ahead_ns()
+            if abs(ahead_ns - self._ros_ahead_ns) > ROS_STEP_NS:  # else this thread had to wait between
+                self._ros_ahead_ns = ahead_ns
+        return self._ros_ahead_ns
+
+
+def _ros_ahead_ns() -> int:
+    """UNIX time less monotonic time [ns], of three looks the one that took least."""
+    looks = []
+    for _ in range(3):
+        before_ns, ros_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        looks.append((after_ns - before_ns, ros_ns - before_ns))
+    return min(looks)[1]
 
 
 class SimulatedClock(Clock):

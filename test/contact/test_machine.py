@@ -3,6 +3,7 @@
 
 import re
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -315,6 +316,18 @@ def test_wall_clock_returns_at_the_time_and_at_once_after_it():
     clock.wait_until(time_ns)
     assert clock.now_ns() >= time_ns
     clock.wait_until(time_ns - 10**12)
+
+
+@pytest.mark.parametrize("step_s", [-1.0, 0.4, 3600.0])
+def test_wall_clock_follows_ros_time_that_is_set(monkeypatch, step_s):
+    """Else forces over a block, and the age of a contact, would be those of another time from then on."""
+    clock, set_s, time_ns = WallClock(), 0.0, time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: time_ns() + round(1e9 * set_s))
+    before = clock.ros_ns(0)
+    assert clock.ros_ns(0) == before
+    set_s = step_s
+    assert clock.ros_ns(0) - before == pytest.approx(1e9 * step_s, abs=1e6)
+    assert clock.own_ns(clock.ros_ns(123)) == 123
 
 
 def test_stop_that_the_arm_did_not_hear_is_told_again():
