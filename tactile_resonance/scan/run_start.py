@@ -120,7 +120,7 @@ def start_run(
         "name": scene.name,
         "notes": scene.notes.as_json(),
         "scan_node": {
-            "contact": "robot" if hands.free_air else "none",
+            "contact": _contact_of(hands),
             "table_in_base": frames.table_in_base.vector.tolist(),
             "base_frame": frames.base,
         },
@@ -217,6 +217,10 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
         began = noted.get("table_in_base")
         accepted = f"{began}, with which the run began, to resume it"
         require(began in (None, table), "table_in_base", table, accepted)
+        # without contact the tip is taken to be where nothing may have brought it
+        contact, began = _contact_of(hands), noted.get("contact")
+        accepted = f"{began}, with which the run began, to resume it"
+        require(began in (None, contact), "contact", contact, accepted)
         scene = read_run_scene(run.path / "scene.yaml")
         _require_force(scene, hands.free_air)
         _require_tests(scene, hands)
@@ -226,6 +230,11 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
     except BaseException:
         run.close()
         raise
+
+
+def _contact_of(hands: Hands) -> str:
+    """Value of scan_node's parameter ``contact``."""
+    return "robot" if hands.free_air else "none"
 
 
 def _placed(scene: ScanScene, frames: Frames, hands: Hands) -> ScanScene:

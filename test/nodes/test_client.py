@@ -359,6 +359,24 @@ def test_a_run_that_began_with_another_table_is_not_resumed(stack):
     assert "with which the run began" in outcome.message
 
 
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_a_run_that_began_with_a_robot_is_not_resumed_without(stack):
+    """Poles of air would count as those of its points: nothing brings the tip there."""
+    stack.activate()
+    future = stack.begin([], run_directory="mine")
+    stack.client.cancel()
+    run = Path(stack.ended(future).run_directory)
+    facts = json.loads((run / "run.json").read_text())
+    assert facts["facts"]["scan_node"]["contact"] == "none"
+    facts["facts"]["scan_node"]["contact"] = "robot"
+    facts["crc32"] = checksum_of({key: facts[key] for key in facts if key != "crc32"})
+    (run / "run.json").write_text(json.dumps(facts))
+    outcome = stack.ended(stack.client.scan(run_directory="mine", resume=True))
+    assert outcome.ending is Ending.REFUSED
+    accepted = "accepted is robot, with which the run began, to resume it"
+    assert outcome.message == f"contact: got 'none'; {accepted}"
+
+
 def test_a_scan_node_in_a_namespace_is_named(stack):
     client = TactileClient(stack.user, namespace="left")
     outcome = stack.ended(client.scan(**GOAL, wait_s=0.3))
