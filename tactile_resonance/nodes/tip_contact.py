@@ -194,10 +194,17 @@ class TipContact:
             self._seen_within(msg.ContactState.STATE_IDLE, TOUCH_RETRACT_WITHIN_S)
 
     def check(self) -> None:
-        """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer."""
+        """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer.
+
+        `PointDisturbed` also where none was made, and the tip moves or touches for somebody else.
+        """
         state = self._state
         if self.touching and state.state not in (UNKNOWN.state, state.STATE_HOLD):
             raise self.failure(state)
+        free = (UNKNOWN.state, state.STATE_IDLE, state.STATE_FAULT)
+        if not self.touching and state.state not in free:
+            text = f"contact: {state.state}: asked for by another client, the tip is not at rest in air"
+            raise PointDisturbed(text, Cause.BUSY.value)
 
     def _make(self, goal: MakeContact.Goal, check: Check) -> MakeContact.Result:
         """Contact that was reached; `PointFailed` or `PointDisturbed` where it was not."""

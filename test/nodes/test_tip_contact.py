@@ -86,3 +86,16 @@ def test_a_tip_that_is_held_ends_the_scan_with_the_reason(monkeypatch):
 @pytest.mark.parametrize(("moved_n", "told_n"), [(-2e-3, -2e-3), (0.0, 0.0), (float("nan"), 0.0)])
 def test_a_tip_that_is_free_tells_how_far_its_zero_moved(monkeypatch, moved_n, told_n):
     assert drawn_back(monkeypatch, state="idle", zero_moved_n=moved_n) == told_n
+
+
+@pytest.mark.parametrize("state", ["approach", "hold", "retract"])
+def test_a_reference_in_air_is_disturbed_where_another_client_moves_the_tip(state):
+    tip = TipContact.__new__(TipContact)
+    tip.touching, tip.stopped = False, False
+    for free in ("", "idle", "fault"):
+        tip._state = msg.ContactState(state=free)
+        tip.check()
+    tip._state = msg.ContactState(state=state)
+    with pytest.raises(PointDisturbed, match=f"contact: {state}: asked for by another client") as caught:
+        tip.check()
+    assert caught.value.kind == "busy"
