@@ -43,8 +43,9 @@ class DetectionLines:
     linear_output_power, excited_input_power : (..., L) float
         Power of output and input at the excited lines around, averaged over realisations: what the
         levels refer to. NaN outside the excited band.
-    noise_dof : int
-        Degrees of freedom of the variances of one realisation.
+    noise_dof : float
+        Degrees of freedom of the variances of one realisation; no more than there are bins between
+        harmonics for each line, where lines share these.
     """
 
     harmonics: IntArray
@@ -55,7 +56,7 @@ class DetectionLines:
     corrected_variance: FloatArray
     linear_output_power: FloatArray
     excited_input_power: FloatArray
-    noise_dof: int
+    noise_dof: float
 
     @property
     def in_band(self) -> BoolArray:
@@ -104,20 +105,26 @@ class DetectionLines:
         """(...) True where the in-band lines hold more than noise, at `FALSE_ALARM`.
 
         None where it cannot be estimated: single periods, or no line of this parity.
+
+        Notes
+        -----
+        Of noise alone, of whatever size, the share of the mean in the power of all periods of a line is
+        Beta(1, dof) distributed and independent of that power. Of the sum over lines, given these powers, mean
+        and variance are known, whether lines are alike or not; its distribution is taken for that Beta which
+        has them.
         """
-        inside = self.in_band
-        noise = self.noise_power[..., inside]
+        inside, dof = self.in_band, self.noise_dof
+        noise = self.corrected_variance[..., inside]
         if noise.size == 0 or np.any(np.isnan(noise)):
             return None
-        realisations = self.corrected.shape[-2]
-        total = noise.sum(axis=-1)
-        # degrees of freedom of a sum of unequal powers (Satterthwaite); E of a squared estimate is
-        # larger than the square by (1 + 1 / dof)
-        estimate_dof = realisations * self.noise_dof
-        squares = np.sum(noise**2, axis=-1) * estimate_dof / (estimate_dof + 1)
-        dof = 2 * realisations * total**2 / squares
-        quantile = special.fdtri(dof, dof * self.noise_dof, 1 - FALSE_ALARM)
-        return np.asarray(self.power[..., inside].sum(axis=-1) > quantile * total)
+        noise = dof * noise
+        both = np.abs(self.corrected[..., inside]) ** 2 + noise  # (..., M, L)
+        whole = both.sum(axis=(-2, -1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rest = noise.sum(axis=(-2, -1)) / whole
+            shapes = (dof + 2) * whole**2 / np.sum(both**2, axis=(-2, -1)) - 1  # the sum of both shapes
+            chance = special.betainc(shapes * dof / (1 + dof), shapes / (1 + dof), rest)
+        return np.asarray(chance < FALSE_ALARM)
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,6 +330,7 @@ def _detection_lines(
         )
 
     g = at_lines(y_excited / u_excited)  # (..., M, L)
+    own_bins = (lines.periods - 1) * np.diff(lines.harmonics).mean() if y.shape[-1] > 1 else np.inf
     return DetectionLines(
         harmonics=lines.harmonics,
         frequency_hz=lines.frequency_hz(sample_rate_hz),
@@ -334,7 +342,7 @@ def _detection_lines(
         else error_variance(g, lines.covariance),
         linear_output_power=at_lines(np.mean(np.abs(y_excited) ** 2, axis=-2)),
         excited_input_power=at_lines(np.mean(np.abs(u_excited) ** 2, axis=-2)),
-        noise_dof=lines.noise_dof,
+        noise_dof=min(lines.noise_dof, own_bins),
     )
 
 

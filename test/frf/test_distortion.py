@@ -3,9 +3,14 @@
 
 import numpy as np
 import pytest
-from scipy import io, signal
+from scipy import io, signal, stats
 
-from tactile_resonance.frf.distortion import decibel, nonlinear_distortion, spectra_between
+from tactile_resonance.frf.distortion import (
+    decibel,
+    estimate_distortion,
+    nonlinear_distortion,
+    spectra_between,
+)
 from tactile_resonance.frf.spectra import Spectrum, averaged_spectra, transient_free_spectra
 from tactile_resonance.multisine import Grid, harmonics_on_grid
 
@@ -134,6 +139,23 @@ def test_false_alarms_are_as_rare_as_stated(multisine):
         alarms += int(result.even.above_noise) + int(result.odd.above_noise)
     # 1 % of 600; eight standard deviations of a Poisson number of 6
     assert alarms < 6 + 8 * np.sqrt(6)
+
+
+@pytest.mark.parametrize("method", ["average", "local polynomial"])
+def test_noise_of_the_actuator_channel_is_no_distortion(method, multisine):
+    """Through a resonance it stands on few of the lines, whose variances have a degree of freedom or two."""
+    rng, runs = np.random.default_rng(7), 1500
+    excited, s = np.arange(81, 120, 2), 2j * np.pi * np.arange(513)
+    w0 = 2 * np.pi * 100
+    g = 0.1 + 0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2)
+    u = multisine(excited, SAMPLES, rng, records=(runs, 1, 1))
+    y = np.fft.irfft(np.fft.rfft(u) * g, SAMPLES)
+    u, y = (
+        np.repeat(x, 2, axis=-2) + noise * rng.standard_normal((runs, 1, 2, SAMPLES))
+        for x, noise in ((u, 0.3), (y, 0.01))
+    )
+    found = estimate_distortion(Spectrum.of(u, y), sample_rate_hz=1024.0, harmonics=excited, method=method)
+    assert stats.binom.sf(found.even.above_noise.sum() - 1, runs, 0.015) > 0.005
 
 
 def test_noise_level_is_that_of_the_mean(multisine):
