@@ -148,6 +148,7 @@ def significant_modes(
     quantities: dict[str, npt.NDArray],
     coefficients: FloatArray,
     lines: IntArray,
+    dof: npt.ArrayLike = np.inf,
 ) -> tuple[BoolArray, FloatArray]:
     """Modes that noise alone would not make; those whose covariance is not known are kept.
 
@@ -163,6 +164,8 @@ def significant_modes(
     coefficients : (batch, n, n) float
         Covariance of the free coefficients; NaN where it is not known.
     lines : (batch,) int
+    dof : (batch,) float, optional
+        Complex degrees of freedom where the level is that of the residuals; infinite elsewhere.
 
     Returns
     -------
@@ -187,7 +190,8 @@ def significant_modes(
             residues[rows], real_covariance(sensitivity, coefficients[rows])
         )
     distances[rows] = distance
-    limit = -2 * np.log(NOISE_PASSES_FOR_A_MODE / np.maximum(lines[rows], 1))
+    dof = np.broadcast_to(dof, lines.shape)
+    limit = _farthest_of_noise(2, NOISE_PASSES_FOR_A_MODE / np.maximum(lines[rows], 1), dof[rows])
     found[rows] &= ~(distance < limit[:, None])
     if modes > 1:
         for k, row in enumerate(rows):
@@ -196,9 +200,24 @@ def significant_modes(
             for near in _neighbours(poles[row], there[row]):
                 # nearer than their widths: neither is certain alone, both together are
                 found[row, near] = _significant_together(
-                    residues[row, near], sensitivity[k, near], coefficients[row], int(lines[row])
+                    *(residues[row, near], sensitivity[k, near], coefficients[row]),
+                    *(int(lines[row]), float(dof[row])),
                 )
     return found, distances
+
+
+def _farthest_of_noise(size: int, chance: npt.ArrayLike, dof: npt.ArrayLike) -> FloatArray:
+    """Squared distance of so many values from zero that noise exceeds by chance.
+
+    In the covariance that they have for a level of complex `dof`: `noise_level.student_variance` times that of
+    the level found.
+    """
+    dof, chance = np.asarray(dof), np.asarray(chance)
+    limit = special.chdtri(size, chance)
+    if np.isfinite(dof).any():
+        of_level = size * special.fdtri(size, 2 * dof, 1 - chance) * (1 - 1 / dof)
+        limit = np.where(np.isfinite(dof), of_level, limit)
+    return np.asarray(limit)
 
 
 def fall_of_noise(lines: npt.ArrayLike) -> FloatArray:
@@ -271,7 +290,7 @@ def squared_distance(values: ComplexArray, covariance: FloatArray) -> FloatArray
 
 
 def _significant_together(
-    residues: ComplexArray, sensitivity: ComplexArray, coefficients: FloatArray, lines: int
+    residues: ComplexArray, sensitivity: ComplexArray, coefficients: FloatArray, lines: int, dof: float
 ) -> bool:
     """Whether noise alone would not make all of them: as above, over the choices of lines."""
     stacked = np.concatenate([sensitivity.real, sensitivity.imag])  # (2 n, p)
@@ -283,4 +302,4 @@ def _significant_together(
     except np.linalg.LinAlgError:
         return True
     chance = NOISE_PASSES_FOR_A_MODE / comb(max(lines, residues.size), residues.size)
-    return not distance < special.chdtri(vector.size, chance)
+    return not distance < _farthest_of_noise(vector.size, chance, dof)

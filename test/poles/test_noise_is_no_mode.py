@@ -17,6 +17,7 @@ from poles.mode_at_250_hz import (
 )
 from scipy import stats
 
+from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.judgement import single
@@ -53,6 +54,19 @@ def test_frfs_without_a_mode_have_none():
     assert (
         result.significant == np.isfinite(result.poles_rad_s)
     ).mean() < 0.5  # some fits found one
+
+
+@pytest.mark.parametrize("order", [2, 4])
+@pytest.mark.parametrize("every", [1, 3])
+def test_frfs_whose_variance_is_not_known_have_none_either(order, every):
+    """The level is that of the residuals of as few as 14 lines, so that residues over it are F distributed."""
+    rng, lines_hz = np.random.default_rng(3), LINES_HZ[::every]
+    noise = circular(rng, (RUNS, lines_hz.size), 1e-2)
+    kind = ModelStructure(order, order + 2)
+    told = identify_batch(FRF(lines_hz, 1 + noise), structure=kind).has_status(PolesStatus.NO_RESONANCE)
+    assert stats.binom.sf((~told).sum() - 1, RUNS, 0.01) > 1e-3  # of some no minimum is found
+    there = identify_batch(FRF(lines_hz, G[::every] + noise), structure=BARE)
+    assert there.has_status(PolesStatus.NO_COVARIANCE).mean() > 0.98
 
 
 @pytest.mark.parametrize("structure", [BARE, ModelStructure()], ids=["bare", "default"])
