@@ -336,7 +336,7 @@ def read_recording(
     for name in sorted({*_FIELDS}.intersection(names) - fields.keys()):
         raise ValueError(f"{name}: no numbers in {path.name}, expected numbers, or no such field")
     if sample_rate_hz is None:
-        sample_rate_hz = _sample_rate(fields, path)
+        sample_rate_hz = _sample_rate(fields, path, np.shape(fields[u]))
     if samples_per_period is None and "samples_per_period" in fields:
         samples_per_period = whole(_scalar(fields, "samples_per_period"), "samples_per_period", 4)
     if excited_harmonics is None:
@@ -354,10 +354,14 @@ def read_recording(
     )
 
 
-def _sample_rate(fields: Mapping[str, np.ndarray], path: Path) -> float:
+def _sample_rate(fields: Mapping[str, np.ndarray], path: Path, shape: tuple[int, ...]) -> float:
+    """Of a channel of that shape; times may be those of all of it, or of its last axes."""
     rate_hz = _scalar(fields, "sample_rate_hz") if "sample_rate_hz" in fields else None
     if "time_s" in fields:
         time_s = np.ravel(fields["time_s"])
+        sizes = np.cumprod(shape[::-1], dtype=int).tolist() or [1]
+        if time_s.size not in sizes:
+            raise ValueError(f"time_s: {time_s.size} values, expected one for each of {sizes[-1]} samples")
         step = np.diff(time_s)
         alike = step.size > 0 and bool(np.all(np.abs(step - step.mean()) < 0.01 * step.mean()))
         if rate_hz is None and not alike:

@@ -228,6 +228,17 @@ def test_times_and_a_rate_that_contradict_each_other_are_refused(tmp_path, field
     assert read_recording(path, sample_rate_hz=50.0).sample_rate_hz == 50.0
 
 
+def test_times_of_another_length_than_the_record_are_refused(tmp_path):
+    path, u = tmp_path / "a.npz", np.random.default_rng(0).standard_normal((2, 3, 8))
+    for count, accepted in ((8, True), (24, True), (48, True), (7, False), (25, False)):
+        np.savez(path, u=u, y=u, time_s=np.arange(count) / 10.0)
+        if accepted:
+            assert read_recording(path).sample_rate_hz == pytest.approx(10)
+            continue
+        with pytest.raises(ValueError, match=f"time_s: {count} values, expected one for each of 48 samples"):
+            read_recording(path)
+
+
 def test_missing_fields_are_named_with_those_present(tmp_path, fields):
     for name in ("u", "y", "sample_rate_hz"):
         left = {key: value for key, value in fields.items() if key != name}
