@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import signal
+from scipy import signal, stats
 
 from tactile_resonance.frf.estimate import frf_of_realisations
 from tactile_resonance.frf.faults import FaultKind
@@ -42,6 +42,19 @@ def test_delay_is_unbiased_and_its_deviation_true(multisine, gain):
     assert abs(np.mean(errors)) < 0.28
     assert np.std(errors) == pytest.approx(1, abs=0.2)
     assert skew.gain == pytest.approx(gain, rel=0.01)
+
+
+@pytest.mark.parametrize("lines", [3, 4, 6])
+def test_few_lines_hold_the_delay_as_often_as_many(lines, multisine):
+    rng, runs, at = np.random.default_rng(5), 600, np.arange(20, 20 + 15 * lines, 15)
+    u = multisine(at, SAMPLES, rng, amplitude=0.1)
+    held = 0
+    for _ in range(runs):
+        noisy = (np.tile(u, (2, 1)) + 0.003 * rng.standard_normal((2, SAMPLES)) for _ in range(2))
+        skew = skew_from_loopback(*noisy, sample_rate_hz=RATE, harmonics=at)
+        held += abs(skew.delay_s) < 1.96 * skew.delay_std_s
+    assert stats.binom.cdf(held, runs, 0.95) > 1e-3
+    assert stats.binom.sf(held - 1, runs, 0.95) > 1e-3
 
 
 @pytest.mark.parametrize("delay_s", [-2.3e-3, -1e-6, 0.0, 4.5e-3])
