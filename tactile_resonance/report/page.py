@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import known
@@ -229,8 +230,8 @@ def frf_entry(message: Any, poles: Poles | None, most_lines: int) -> dict[str, A
         Beyond that lines outside of the bands, then within, are left out evenly.
     """
     frequency_hz, g = array_of(message.frequency_hz), complex_of(message, "")
-    name = "variance_total" if len(message.variance_total) else "variance_noise"
-    variance = array_of(getattr(message, name))
+    of = "total" if len(message.variance_total) else "noise"
+    variance, dof = array_of(getattr(message, f"variance_{of}")), getattr(message, f"{of}_dof")
     std = np.sqrt(variance) if variance.size else np.full(g.shape, np.nan)
     bands = () if poles is None else poles.bands
     shown = shown_lines(frequency_hz, [band.band_hz for band in bands], most_lines)
@@ -239,10 +240,20 @@ def frf_entry(message: Any, poles: Poles | None, most_lines: int) -> dict[str, A
         "re": listed(g.real[shown]),
         "im": listed(g.imag[shown]),
         "std": listed(std[shown]),
-        "std_of": name.replace("variance_", ""),
+        "std_of": of,
+        "bar_stds": _half_bar(dof),
         "lines": int(frequency_hz.size),
         "models": [entry for band in bands if (entry := _model_entry(frequency_hz, g, std, band))],
     }
+
+
+def _half_bar(dof: int) -> float:
+    """Half of a 95 % bar of ``|G|``, in roots of ``E|dG|^2``, of which half is along G.
+
+    The variance rests on ``dof`` complex residuals (0: unknown), which are twice as many real ones.
+    """
+    quantile = special.stdtrit(2 * dof, 0.975) if dof else special.ndtri(0.975)
+    return float(quantile) / math.sqrt(2)
 
 
 def shown_lines(

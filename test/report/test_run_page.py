@@ -10,6 +10,7 @@ from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from tactile_resonance.cli import main
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.report import point_details
-from tactile_resonance.report.page import as_json, model_response, s_plane
+from tactile_resonance.report.page import as_json, frf_entry, model_response, s_plane
 from tactile_resonance.report.point_details import MOST_DETAILED, detailed, lines_each
 from tactile_resonance.report.run_report import as_page, warnings_of
 from tactile_resonance.scan import tissue_tests
@@ -100,6 +101,26 @@ def test_the_data_of_the_page_are_those_of_the_run(hostile):
         assert point["force_mn"] == 1e3 * result.force_n
     surface = run["bands"][0]["surface"]
     assert np.shape(surface["f0_hz"]) == (len(surface["y_mm"]), len(surface["x_mm"]))
+
+
+@pytest.mark.parametrize("dof", [1, 7, 0])
+def test_bars_of_an_frf_hold_its_level_as_often_as_they_say(dof):
+    """Of normal errors whose variance is estimated with so many degrees of freedom; 0: known."""
+    rng, lines = np.random.default_rng(1), 20_000
+
+    def noise(*shape):
+        return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * np.sqrt(0.5)
+
+    true, scale = np.exp(2j * np.pi * rng.random(lines)), 1e-3
+    estimated = np.mean(np.abs(noise(dof, lines)) ** 2, axis=0) if dof else np.ones(lines)
+    g = true + scale * noise(lines)
+    message = SimpleNamespace(frequency_hz=np.arange(1.0, lines + 1), real=g.real, imag=g.imag)
+    message.variance_total, message.total_dof = scale**2 * estimated, dof
+    entry = frf_entry(message, None, lines)
+    g, std = np.array(entry["re"]) + 1j * np.array(entry["im"]), np.array(entry["std"])
+    half_db = 20 / np.log(10) * entry["bar_stds"] * std / np.abs(g)  # as page.js
+    held = np.abs(20 * np.log10(np.abs(g))) <= half_db
+    assert np.mean(held) == pytest.approx(0.95, abs=0.008)  # five standard deviations of the part
 
 
 def test_a_click_shows_the_frf_that_was_recorded_and_the_model_that_was_identified(hostile):

@@ -222,7 +222,7 @@
     let range = null;
     there.forEach(({ run, point, detail }, n) => {
       const frf = detail.frf, colour = COLOURS[n % COLOURS.length], name = plain(nameOf(run, point));
-      const bars = frf.std.map((std, k) => (std === null ? 0 : (1.96 * DB * std) / Math.hypot(frf.re[k], frf.im[k])));
+      const bars = frf.std.map((std, k) => (std === null ? 0 : (frf.bar_stds * DB * std) / Math.hypot(frf.re[k], frf.im[k])));
       const data = { type: "scatter", mode: "markers", x: frf.frequency_hz, marker: { size: 4, color: colour }, legendgroup: `${n}` };
       traces.push({ ...data, y: level(frf.re, frf.im), name, error_y: { type: "data", array: bars, thickness: 1, width: 2 } });
       traces.push({ ...data, y: phase(frf.re, frf.im), yaxis: "y2", showlegend: false });
