@@ -13,7 +13,7 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.record import Origin
-from tactile_resonance.recording.messages import poles_from_message
+from tactile_resonance.recording.messages import poles_from_message, time_from_message
 from tactile_resonance.report.page import (
     MN,
     evenly,
@@ -126,14 +126,15 @@ def read_details(run: RunContent, result: PointResult) -> PointDetails:
     own = result.measurement_id
     frf, poles, told, force = None, None, [], []
     types = (FRF_TYPE, POLES_TYPE, STATE_TYPE, EXCITATION)
-    begun_ns: int | None = None
-    for time_ns, topic, message in read_messages(file_of(run.path, result), *types):
+    begun = False
+    for _, topic, message in read_messages(file_of(run.path, result), *types):
         if topic.endswith("/contact_state"):
-            if begun_ns is not None and np.isfinite(message.force_n):
-                force.append((1e-9 * (time_ns - begun_ns), float(message.force_n)))
+            if begun and np.isfinite(message.force_n):
+                # of the nodes' clock: in simulated time that of the recording goes on otherwise
+                force.append((time_from_message(message.header.stamp), float(message.force_n)))
         elif message.measurement_id == own:
             if topic.endswith("/excitation"):
-                begun_ns = time_ns
+                begun = True
             elif topic.endswith("/frf"):
                 frf = message
             else:
@@ -142,7 +143,8 @@ def read_details(run: RunContent, result: PointResult) -> PointDetails:
                     poles = told[-1][0]
     truth = truth_of_point(told, result) if result.simulated else None
     step = 1 + len(force) // _MOST_FORCES
-    return PointDetails(frf, poles, tuple(force[::step]), truth)
+    shown = tuple((1e-9 * (at_ns - force[0][0]), force_n) for at_ns, force_n in force[::step])
+    return PointDetails(frf, poles, shown, truth)
 
 
 @dataclass(frozen=True, eq=False)

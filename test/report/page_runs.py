@@ -29,6 +29,7 @@ from scanned import START_NS, begin, measure
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)> %{x} & \u2028"
 PERIODS = 4
 BAND_HZ = (200.0, 300.0)
+SIMULATED_NS, STATE_STEP_NS = 30 * 10**9, 40_000_000
 
 
 def write_scene(path, spacing_m=0.01, name="gelatine with an inclusion", tissue="gelatine 10 %"):
@@ -86,13 +87,16 @@ def record(recording, result, phantoms, bench, design):
 
     def write(topic, kind, after_ns=0, **values):
         whole = {k: np.ascontiguousarray(v) if isinstance(v, np.ndarray) else v for k, v in values.items()}
-        message = make_message(kind, **({} if kind == STATE_TYPE else own), **whole)
+        message = make_message(kind, **(own if "header" not in values else {}), **whole)
         recording.write(topic, kind, stamp_ns + after_ns, to_cdr(message))
 
     write("/left/excitation", EXCITATION, sample_rate_hz=5e4, samples_per_period=20000)
     for k in range(10):
         force_n = 0.01 + 1e-4 * np.sin(k)
-        write("/left/contact_state", STATE_TYPE, (k + 1) * 40_000_000, state="hold", force_n=force_n)
+        # in simulated time: a millisecond there takes three of the recording
+        header = header_message("tip", SIMULATED_NS + (k + 1) * STATE_STEP_NS)
+        state = {"header": header, "state": "hold", "force_n": force_n}
+        write("/left/contact_state", STATE_TYPE, 3 * (k + 1) * STATE_STEP_NS, **state)
     of_frf = {"frequency_hz": frf.frequency_hz, "real": frf.g.real, "imag": frf.g.imag}
     counts = {"periods": PERIODS, "realisations": 1, "noise_dof": frf.noise_dof}
     write("/left/frf", FRF_TYPE, 500_000_000, **of_frf, variance_noise=frf.variance_noise, **counts)

@@ -29,7 +29,7 @@ from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.tissue_tests import fits_at
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from page_runs import BAND_HZ, HOSTILE, scan, write_scene
+from page_runs import BAND_HZ, HOSTILE, STATE_STEP_NS, scan, write_scene
 
 from browser import browser
 
@@ -144,7 +144,7 @@ def test_a_click_shows_the_frf_that_was_recorded_and_the_model_that_was_identifi
         assert np.max(off) < 5 * np.sqrt(np.max(frf.variance_noise[inside]))
         (pole,) = detail["poles"]
         assert complex(pole["re"], pole["im"]) == pytest.approx(complex(poles.poles_rad_s[0]), rel=1e-9)
-        assert len(detail["force"]["t_s"]) == 10
+        np.testing.assert_allclose(detail["force"]["t_s"], 1e-9 * STATE_STEP_NS * np.arange(10), atol=1e-6)
         np.testing.assert_allclose(detail["force"]["force_mn"][1], 10 + 0.1 * np.sin(1), rtol=1e-4)
         assert abs(detail["truth"]["f0_hz"] - pole["f0_hz"]) < 5 * pole["f0_std_hz"]
 
