@@ -151,9 +151,13 @@ def _distortion(run: RunContent, details: Mapping[int, PointDetails]) -> list[Fi
     first = [r.distortion[0] for r in told]
     for name, colour in _PARITIES.items():
         level, noise = ([getattr(d, f"{name}_{of}db") for d in first] for of in ("", "noise_"))
-        traces.append(_trace(f"{name} distortion", points, level, colour))
+        traces.append(_trace(f"{name} lines", points, level, colour))
         traces.append(_trace(f"noise at {name} lines", points, noise, colour, "circle-open"))
-    note = "Against the linear output in the first band, at the one level of the drive of a run."
+    above = ", ".join(f"{n} {sum(getattr(d, f'{n}_above_noise') for d in first)}" for n in _PARITIES)
+    note = "Against the linear output in the first band, at the one level of the drive of a run. "
+    note += f"Points with more than noise, of {len(first)}: {above}."
+    if unknown := sum(np.isnan([d.even_noise_db, d.odd_noise_db]).all() for d in first):
+        note += f" Noise is unknown at {unknown}."
     figures.append(_figure("Levels of distortion (figure 6)", note, traces, "point", "[dB]"))
     return figures
 

@@ -150,10 +150,14 @@ def bands_table(results: Sequence[PointResult]) -> str:
 
 
 def distortion_table(results: Sequence[PointResult]) -> str:
-    """Levels at the lines left out, against those excited; in brackets the noise; empty where unknown."""
+    """Levels at the lines left out, against those excited; in brackets the noise, as far as it is known."""
     sides = ("output, even [dB]", "output, odd [dB]", "input, even [dB]", "input, odd [dB]")
 
     def level(value_db: float, noise_db: float, above: bool) -> str:
+        if np.isnan(value_db):
+            return "-"
+        if np.isnan(noise_db):
+            return f"{_number(value_db, 1)}, noise unknown"
         text = f"{_number(value_db, 1)} ({_number(noise_db, 1)})"
         return text if above else f"{text}, only noise"
 

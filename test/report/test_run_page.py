@@ -17,12 +17,15 @@ import pytest
 
 from benchmarks.mechanics import relaxation
 from tactile_resonance.cli import main
+from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.report import point_details
 from tactile_resonance.report.page import as_json, frf_entry, model_response, s_plane
+from tactile_resonance.report.paper_figures import paper_figures
 from tactile_resonance.report.point_details import MOST_DETAILED, detailed, lines_each
 from tactile_resonance.report.run_report import as_page, warnings_of
+from tactile_resonance.report.run_tables import distortion_table
 from tactile_resonance.scan import tissue_tests
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.run_content import read_run
@@ -259,6 +262,25 @@ def test_a_point_off_its_force_is_named(hostile):
     off = tuple(replace(r, force_n=0.012, force_std_n=1e-4) if r.index == 2 else r for r in run.results)
     (line,) = [t for t in warnings_of(replace(run, results=off)) if "force other than" in t]
     assert line == "force other than the scene's, 1 of 9 points: 3 (12.00 mN)"
+
+
+def test_what_is_not_known_of_distortion_is_not_called_noise(hostile, monkeypatch):
+    nan, band = np.nan, {"low_hz": 200.0, "high_hz": 300.0}
+    cases = [
+        BandDistortion(**band, even_db=-50.0, even_noise_db=-60.0, even_above_noise=True),
+        BandDistortion(**band, even_db=-60.0, even_noise_db=-60.0),
+        BandDistortion(**band, even_db=-11.4, even_noise_db=nan),  # of one block, from rest
+        BandDistortion(**band),
+    ]
+    results = [PointResult(k, distortion=(of,)) for k, of in enumerate(cases)]
+    rows = re.findall("<tr>(.*?)</tr>", distortion_table(results).split("<tbody>")[1])
+    even = [re.findall("<td>(.*?)</td>", row)[2] for row in rows]
+    assert even == ["-50.0 (-60.0)", "-60.0 (-60.0), only noise", "-11.4, noise unknown", "-"]
+    monkeypatch.setattr("tactile_resonance.report.paper_figures.measurements_of_file", lambda _: [])
+    run = replace(read_run(hostile[0]), results=tuple(results))
+    (figure,) = [f for f in paper_figures(run, {}) if "figure 6" in f["title"]]
+    assert "Points with more than noise, of 4: even 1, odd 0. Noise is unknown at 2." in figure["note"]
+    assert [t["name"] for t in figure["traces"][::2]] == ["even lines", "odd lines"]
 
 
 def test_figures_of_the_paper_that_a_run_cannot_give_say_why(hostile):
