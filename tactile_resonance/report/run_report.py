@@ -198,11 +198,7 @@ def warnings_of(
     not_tested = _not_tested(run, scene, details or {})
     for what, points, why in (
         ("failed", [r for r in results if r.outcome is PointOutcome.FAILED], lambda r: r.reason),
-        (
-            "poles with a remark",
-            [r for r in measured if r.poles_status not in SURE],
-            lambda r: r.poles_status,
-        ),
+        ("poles with a remark", [r for r in measured if _remarks(r)], _remarks),
         ("precision out of reach", hopeless, lambda r: f"{counted(r.blocks, 'block')}"),
         ("force other than the scene's", off, lambda r: f"{1e3 * r.force_n:.2f} mN"),
         ("force not quiet at first", [r for r in measured if r.gate], lambda r: r.gate),
@@ -250,6 +246,17 @@ def _not_tested(
         if reasons:
             why[result.index] = "; ".join(reasons)
     return why
+
+
+def _remarks(result: PointResult) -> str:
+    """Status of the poles of each band where something speaks against them; empty: nothing does."""
+    further = [
+        f"{band.band_low_hz:g} to {band.band_high_hz:g} Hz: {band.poles_status}"
+        for band in result.further
+        if band.poles_status not in SURE
+    ]
+    first = [] if result.poles_status in SURE else [result.poles_status]
+    return "; ".join(first + further)
 
 
 def _force_is_off(result: PointResult, force_n: float) -> bool:

@@ -27,7 +27,7 @@ from tactile_resonance.report.point_details import MOST_DETAILED, detailed, line
 from tactile_resonance.report.run_report import as_page, warnings_of
 from tactile_resonance.report.run_tables import distortion_table
 from tactile_resonance.scan import tissue_tests
-from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.point_result import BandResult, PointOutcome, PointResult
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.tissue_tests import fits_at
 
@@ -262,6 +262,18 @@ def test_a_point_off_its_force_is_named(hostile):
     off = tuple(replace(r, force_n=0.012, force_std_n=1e-4) if r.index == 2 else r for r in run.results)
     (line,) = [t for t in warnings_of(replace(run, results=off)) if "force other than" in t]
     assert line == "force other than the scene's, 1 of 9 points: 3 (12.00 mN)"
+
+
+def test_poles_of_a_further_band_with_a_remark_are_named(hostile):
+    folder, _ = hostile
+    run = read_run(folder)
+    assert not [line for line in warnings_of(run) if "remark" in line]
+    statuses = {1: "ok", 2: "model error", 3: "no resonance"}
+    further = {k: (BandResult(600.0, 800.0, poles_status=status),) for k, status in statuses.items()}
+    results = tuple(replace(r, further=further.get(r.index, ())) for r in run.results)
+    (line,) = [t for t in warnings_of(replace(run, results=results)) if "remark" in t]
+    told = "3 (600 to 800 Hz: model error), 4 (600 to 800 Hz: no resonance)"
+    assert line == f"poles with a remark, 2 of 9 points: {told}"
 
 
 def test_what_is_not_known_of_distortion_is_not_called_noise(hostile, monkeypatch):
