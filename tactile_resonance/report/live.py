@@ -185,7 +185,9 @@ class LiveRun:
         with self._lock:
             forces = [[*listed([t], 12), known(MN * f)] for t, f in self._forces]
             self._forces.clear()
-            failed = sum(r.failed for r in self._results.values())
+            failed = sum(
+                r.failed and r.outcome is not PointOutcome.SKIPPED for r in self._results.values()
+            )
             simulated = any(r.simulated for r in self._results.values())
             counts = {"points": len(self._results), "failed": failed, "simulated": simulated}
             self._publish("now", {"text": self._text(), "forces": forces, **counts})

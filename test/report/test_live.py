@@ -67,6 +67,16 @@ def test_points_come_out_as_the_report_shows_them():
     assert snapshot["newest"] == 2
 
 
+def test_a_point_that_is_skipped_has_not_failed():
+    live = LiveRun(heard := Heard())
+    live.take_result(result(0), None)
+    live.take_result(result(1, outcome=PointOutcome.FAILED, f0_hz=math.nan), None)
+    live.take_result(result(2, outcome=PointOutcome.SKIPPED, f0_hz=math.nan), None)
+    live.take_result(result(3, f0_hz=math.nan), None)
+    live.tick()
+    assert (heard.of("now")[-1]["points"], heard.of("now")[-1]["failed"]) == (4, 2)
+
+
 def test_what_does_not_count_is_not_shown():
     live = LiveRun(heard := Heard())
     live.take_result(result(0, outcome=PointOutcome.DISCARDED), None)
