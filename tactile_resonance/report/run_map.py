@@ -33,6 +33,7 @@ from tactile_resonance.report.drawing import PROBABILITY, SIMULATED, new_figure
 from tactile_resonance.report.page import MM
 from tactile_resonance.report.run_report import scene_of
 from tactile_resonance.scan.adaptive import Adaptive, known_points
+from tactile_resonance.scan.kriging import LEAST_POINTS
 from tactile_resonance.scan.level_set import PROBABILITY as LINE_PROBABILITY
 from tactile_resonance.scan.level_set import Boundary, Lines, difference_m2
 from tactile_resonance.scan.map_messages import (
@@ -222,7 +223,7 @@ def draw_pole_map(pole_map: PoleMap, title: str, boundary: RunBoundary | None = 
     )
     if surface is None:
         unsure.set_axis_off()
-        why = "too few points for a surface between them"
+        why = f"no surface: {LEAST_POINTS} points with a standard deviation, not on one line, are needed"
         unsure.text(0.5, 0.5, why, ha="center", transform=unsure.transAxes)
     else:
         shown = _draw_surface(unsure, surface, surface.f0_std_hz, None)

@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.report import run_map
-from tactile_resonance.report.run_map import boundary_of_run, write_map_recording
+from tactile_resonance.report.run_map import boundary_of_run, draw_pole_map, write_map_recording
 from tactile_resonance.scan.map_messages import CLOUD, MARKERS, POINT
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_file import read_content, read_messages
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.points import ScanPoint
+from tactile_resonance.scan.pole_map import MapPoint, PoleMap
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scene import read_scan_scene
@@ -143,6 +144,12 @@ def test_without_a_point_there_is_no_map(tmp_path):
     RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}).close()
     assert write_map_recording(read_run(tmp_path / "run")) is None
     assert not (tmp_path / "run" / "map.mcap").exists()
+
+
+def test_a_row_of_points_has_no_surface_and_the_picture_says_why():
+    row = PoleMap(tuple(MapPoint.planned(result_of(k)) for k in range(8)))  # more than a surface takes
+    texts = [text.get_text() for text in draw_pole_map(row, "row").axes[1].texts]
+    assert texts == ["no surface: 5 points with a standard deviation, not on one line, are needed"]
 
 
 def test_the_boundary_drawn_is_that_of_boundary_json(tmp_path):
