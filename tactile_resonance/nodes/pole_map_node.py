@@ -135,6 +135,7 @@ class PoleMapNode(ManagedNode):
 
     # diagnostics ask for them from the beginning
     _grown = GrowingMap()
+    _unplaced = GrowingMap()  # points that failed before they had poles: where the tip was nobody knows
     _left_out = 0
 
     def __init__(self) -> None:
@@ -156,7 +157,7 @@ class PoleMapNode(ManagedNode):
         wanted = build(LevelSet, "boundary_f0_hz", *ends) if low or high else None
         (scene,) = values(self, "adaptive_scene")
         self._boundary_of = _boundary_of(wanted, scene)
-        self._grown = GrowingMap()
+        self._grown, self._unplaced = GrowingMap(), GrowingMap()
         self._left_out = 0
         kinds = {"": PointCloud2} | dict.fromkeys(("/markers", "/legend", "/surface"), MarkerArray)
         self._old: set[str] = set()  # outputs that show less than is known
@@ -188,7 +189,7 @@ class PoleMapNode(ManagedNode):
         """For the diagnostics."""
         return {
             "points": str(len(self._grown.map.estimated)),
-            "failures": str(len(self._grown.map.failures)),
+            "failures": str(len(self._grown.map.failures) + len(self._unplaced)),
             "left out": str(self._left_out),
         }
 
@@ -204,6 +205,9 @@ class PoleMapNode(ManagedNode):
         if not counts(result):
             return
         self._grown.clear(result)
+        self._unplaced.clear(result)
+        if result.outcome is PointOutcome.FAILED and not message.poles:
+            self._unplaced.add(MapPoint.planned(result))
         if result.outcome is not PointOutcome.SKIPPED and message.poles:
             point = self._point(message.poles[0], result)
             if point is not None:
@@ -249,7 +253,7 @@ class PoleMapNode(ManagedNode):
         return point
 
     def _clear(self) -> str:
-        cleared, self._grown = len(self._grown), GrowingMap()
+        cleared, self._grown, self._unplaced = len(self._grown), GrowingMap(), GrowingMap()
         self._renew()
         return f"{counted(cleared, 'point')} cleared"
 
@@ -301,7 +305,9 @@ class PoleMapNode(ManagedNode):
         makers: dict[str, Callable[[], Any]] = {
             "": lambda: cloud_message(pole_map, tissues, header),
             "/markers": markers,
-            "/legend": lambda: legend_message(pole_map, scale, probability, tissues, header),
+            "/legend": lambda: legend_message(
+                pole_map, scale, probability, tissues, header, len(self._unplaced)
+            ),
             "/surface": lambda: surface_message(pole_map, cells, header),
         }
         for name in names:

@@ -128,11 +128,17 @@ def legend_message(
     probability: float,
     names: tuple[str, ...],
     header: Message,
+    unplaced: int = 0,
 ) -> Message:
     """Right of the map and as high as it is long: colour bar, its figures, and beside them the lines.
 
     With the map it is little more than twice as wide as high. Each line is a marker: the distance at which
     rviz sets the lines of one text does not follow their height.
+
+    Parameters
+    ----------
+    unplaced : int
+        Points that failed where the tip was nobody knows: they count, and have no cross.
     """
     everything = _marker(header, "", 0, "CUBE")
     everything.action = everything.DELETEALL  # there may be fewer lines than before
@@ -140,7 +146,7 @@ def legend_message(
         return make_message(MARKERS, markers=[everything])
     f0, size_m = pole_map.f0_hz, pole_map.size_m
     ticks = [f"{f0.min() + share * np.ptp(f0):.2f} Hz" for share in (0.0, 0.5, 1.0)]
-    lines = legend_lines(pole_map, scale, probability, names)
+    lines = legend_lines(pole_map, scale, probability, names, unplaced)
     tick_width, line_width = (_CHARACTER * max(map(len, texts)) for texts in (ticks, lines))
     text_m = size_m * min(_TEXTS / line_width, 0.6 / len(lines))
     low, high = pole_map.positions_m.min(axis=0), pole_map.positions_m.max(axis=0)
@@ -173,7 +179,11 @@ def legend_message(
 
 
 def legend_lines(
-    pole_map: PoleMap, scale: EllipseScale, probability: float, names: tuple[str, ...]
+    pole_map: PoleMap,
+    scale: EllipseScale,
+    probability: float,
+    names: tuple[str, ...],
+    unplaced: int = 0,
 ) -> list[str]:
     """What is drawn, and how many points there are, by tissue class with its number in the cloud."""
     lines = [
@@ -181,7 +191,7 @@ def legend_lines(
         f"ellipses: {100 * probability:g} %",
         f"x: 1 mm = {1e-3 / scale.m_per_hz:.2g} Hz of f0",
         f"y: 1 mm = {1e-3 / scale.m_per_damping:.2g} of damping ratio",
-        f"{counted(len(pole_map.estimated), 'point')}, {len(pole_map.failures)} failed",
+        f"{counted(len(pole_map.estimated), 'point')}, {len(pole_map.failures) + unplaced} failed",
     ]
     for name in pole_map.classes():
         number = names.index(name) if name in names else NO_CLASS

@@ -466,7 +466,11 @@ def test_only_what_a_scan_accepts_is_on_the_map(scanned):
     (crosses,) = [m.points for m in markers.markers if m.ns == "failures"]
     assert len(crosses) == 4
     assert np.mean([(p.x, p.y) for p in crosses], axis=0) == pytest.approx([0.012, 0.004])
-    assert scanned.map_node.details()["left out"] == "0"
+    told = scanned.map_node.details()
+    assert (told["left out"], told["failures"]) == ("0", "2")
+    # the legend counts both, though only one has a cross
+    _, texts = bar_and_texts(scanned.read(MarkerArray, "pole_map/legend")[-1])
+    assert "1 point, 2 failed" in [m.text for m in texts]
 
 
 @pytest.mark.parametrize(
@@ -488,6 +492,8 @@ def test_a_point_that_is_repeated_replaces_its_former_result(scanned, outcome, f
     scanned.until(lambda: 260.0 in [p.result.f0_hz for p in scanned.map_node._grown.map.points])
     found = [point.result.f0_hz for point in scanned.map_node._grown.map.estimated]
     assert found == [*left, 260.0]
+    failed = outcome is PointOutcome.FAILED
+    assert scanned.map_node.details()["failures"] == str(int(failed))
 
 
 def test_late_readers_get_the_results_of_a_whole_scan(scanned):
