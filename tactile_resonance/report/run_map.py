@@ -317,9 +317,10 @@ def write_map_recording(run: RunContent) -> Path | None:
         frame_id = _write_frames(writer, run)
         states = min(MOST_STATES, max(1, MOST_DRAWN // len(results)))
         step = -(-len(results) // states)
-        last = GrowingMap(results).map
+        last, scene = GrowingMap(results).map, scene_of(run)
         names = tuple(name for name in last.classes() if name != UNKNOWN)
-        scene = scene_of(run)
+        if scene is not None:  # by number as pole_map_node has them, whichever were called
+            names = tuple(tissue.name for tissue in scene.tissue_classes)
         adaptive = None if scene is None else scene.adaptive
         grown, latest = GrowingMap(), {}
         for done, result in enumerate(results, start=1):

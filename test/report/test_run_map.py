@@ -146,6 +146,20 @@ def test_without_a_point_there_is_no_map(tmp_path):
     assert not (tmp_path / "run" / "map.mcap").exists()
 
 
+def test_classes_have_the_numbers_that_they_have_in_the_scene(tmp_path):
+    scene = share_path("config/scenes/demo.yaml")
+    assert [tissue.name for tissue in read_scan_scene(scene).tissue_classes] == ["gelatine 10 %", "inclusion"]
+    plan = [ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))]
+    run = RunDirectory.create(tmp_path / "run", scene.read_text(), plan, {})
+    with run, run.begin_point(0) as recording:
+        recording.finish(result_of(0, tissue_class="inclusion"))
+    path = write_map_recording(read_run(tmp_path / "run"))
+    ((_, cloud),) = told(path, "/pole_map")
+    assert np.frombuffer(cloud.data.tobytes(), POINT)["tissue_class"].tolist() == [1]
+    texts = [marker.text for marker in told(path, "/pole_map/legend")[-1][1].markers]
+    assert "class 1, inclusion: 1" in texts
+
+
 def test_a_row_of_points_has_no_surface_and_the_picture_says_why():
     row = PoleMap(tuple(MapPoint.planned(result_of(k)) for k in range(8)))  # more than a surface takes
     texts = [text.get_text() for text in draw_pole_map(row, "row").axes[1].texts]
