@@ -290,10 +290,14 @@ def hum(x: _Channel) -> Fault | None:
     found: list[tuple[float, float, bool]] = []
     for mains in MAINS_HZ:
         peaks = []
-        for hz, around, peak, limit, near in places[mains]:
-            floor = np.median(power[around]) / np.log(2)  # mean of an exponential distribution
-            if power[peak].max() > max(2 * limit * floor, rounding):
-                peaks.append((hz, float(power[peak].sum()), near))
+        for hz, alike, near in places[mains]:
+            standing = 0.0
+            for around, peak, limit in alike:
+                floor = np.median(power[around]) / np.log(2)  # mean of an exponential distribution
+                if power[peak].max() > max(2 * limit * floor, rounding):
+                    standing += float(power[peak].sum())
+            if standing:
+                peaks.append((hz, standing, near))
         # the fundamental may be hidden, a single high harmonic may be anything
         if peaks and (peaks[0][0] == mains or len(peaks) > 1):
             found += peaks
@@ -308,11 +312,12 @@ def hum(x: _Channel) -> Fault | None:
 @lru_cache(maxsize=16)
 def _hum_places(
     sample_rate_hz: float, periods: int, samples: int, harmonics: bytes
-) -> tuple[int, dict[float, list[tuple[float, IntArray, IntArray, float, bool]]]]:
+) -> tuple[int, dict[float, list[tuple[float, list[tuple[IntArray, IntArray, float]], bool]]]]:
     """How many bins hum needs, and where it shows, by mains frequency.
 
-    Each a frequency [Hz], bins around it and on it, the limit of the largest of these over the mean of those,
-    and whether an excited line is near; `harmonics` are bytes of int64.
+    Each a frequency [Hz], bins around it and on it with the limit of the largest of these over the mean of
+    those, and whether an excited line is near; `harmonics` are bytes of int64. Bins of a single period are
+    harmonics: those of odd and of even order, which hold distortion of their own, are compared apart.
     """
     resolution = sample_rate_hz / (periods * samples)
     highest = MAINS_HARMONICS * max(MAINS_HZ) / resolution + _HUM_FLOOR_BINS[1]
@@ -334,11 +339,17 @@ def _hum_places(
                 for at in (centre + np.concatenate([-away, away]), centre + np.arange(-1, 2))
             )
             around, peak = around[usable[around]], peak[usable[peak]]
-            if around.size >= 8 and peak.size:
-                # the floor of a few bins is itself uncertain
-                limit = float(special.fdtri(2, 2 * around.size, 1 - _FALSE_ALARM / peak.size))
+            orders = 2 if periods == 1 else 1
+            alike = []
+            for order in range(orders):
+                beside, on = around[around % orders == order], peak[peak % orders == order]
+                if beside.size >= 8 and on.size:
+                    # the floor of a few bins is itself uncertain
+                    limit = special.fdtri(2, 2 * beside.size, 1 - _FALSE_ALARM / peak.size)
+                    alike.append((beside, on, float(limit)))
+            if alike:
                 near = bool(np.any(excited[max(0, centre - 5) : centre + 6]))
-                places[mains].append((k * mains, around, peak, limit, near))
+                places[mains].append((k * mains, alike, near))
     return count, places
 
 

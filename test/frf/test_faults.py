@@ -11,7 +11,7 @@ from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.faults import FaultKind, FaultReport, clocks, find_faults
 from tactile_resonance.frf.result import FrfStatus
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.multisine import design_multisine
+from tactile_resonance.multisine import Grid, design_multisine
 
 RATE, SAMPLES, PERIODS = 2000.0, 1000, 6
 LINES = np.arange(5, 200, 2)  # 10 to 398 Hz
@@ -237,6 +237,21 @@ def test_hum_of_the_silverbox(shared_data):
     )
     assert FaultKind.HUM in kinds(report)
     assert "150" in report.message
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_odd_distortion_in_a_single_period_is_not_hum(seed):
+    """It stands out of the even harmonics, which hold none of it, on either side of 50 Hz and its multiples."""
+    excitation = design_multisine(band_hz=(10.0, 2000.0), grid=Grid.ODD_RANDOM, seed=seed)
+    x, rng = excitation.period()[None], np.random.default_rng(seed)
+    settings = {"sample_rate_hz": excitation.sample_rate_hz, "harmonics": excitation.harmonics}
+    y = x - 0.02 * x**3 + 1e-5 * rng.standard_normal(x.shape)
+    report = find_faults(Spectrum.of(6e-4 * np.round(x / 6e-4), y), **settings)  # as a converter rounds it
+    assert FaultKind.HUM not in kinds(report)
+    t = np.arange(x.size) / excitation.sample_rate_hz
+    y = y + 0.02 * np.sin(2 * np.pi * 50.01 * t)
+    fault = only(find_faults(Spectrum.of(x, y), **settings), FaultKind.HUM, "sensor")
+    assert "at 50" in fault.message
 
 
 def test_distortion_is_not_hum(shared_data):
