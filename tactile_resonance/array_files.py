@@ -155,7 +155,7 @@ def _read_mat(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
 def _read_csv(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = _lines(file)
+            lines = _Lines(file)
             head = next(lines, "")
             dialect = csv.Sniffer().sniff(head, delimiters=",;\t")
             names = [name.strip() for name in next(csv.reader([head], dialect))]
@@ -166,11 +166,11 @@ def _read_csv(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
                 raise ValueError(f"columns named alike: {', '.join(names)}")
             if not (first := next(lines, "")):  # loadtxt warns and returns nothing
                 raise ValueError("no numbers under the header")
-            columns = np.loadtxt(chain([first], lines), delimiter=dialect.delimiter, ndmin=2)
+            columns = _columns(chain([first], lines), lines, dialect.delimiter)
     except (csv.Error, ValueError, StopIteration) as error:
         raise ValueError(
             f"{path.name}: no .csv record ({one_line(error)[:120]}); expected a header line with the names "
-            "of the columns, then numbers"
+            "of the columns, then numbers with decimal points"
         ) from error
     if columns.shape[1] != len(names):
         raise ValueError(
@@ -188,10 +188,26 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _lines(file: TextIO) -> Iterator[str]:
-    """Lines that are not blank."""
-    while line := file.readline(_LONGEST_LINE):
-        if len(line) == _LONGEST_LINE:
-            raise ValueError(f"a line of {_LONGEST_LINE} characters or more")
-        if line.strip():
-            yield line
+def _columns(rows: Iterator[str], lines: _Lines, delimiter: str) -> np.ndarray:
+    """Numbers of `rows`, which end with `lines`; a row that is wrong is named by its line in the file."""
+    try:
+        return np.loadtxt(rows, delimiter=delimiter, ndmin=2)
+    except ValueError as error:  # rows are counted from 0 or from 1, as the fault is
+        raise ValueError(f"line {lines.number}: {one_line(error).partition(' at row ')[0]}") from error
+
+
+class _Lines(Iterator[str]):
+    """Lines that are not blank; `number` is that of the last one in the file, from 1."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+        self.number = 0
+
+    def __next__(self) -> str:
+        while line := self._file.readline(_LONGEST_LINE):
+            self.number += 1
+            if len(line) == _LONGEST_LINE:
+                raise ValueError(f"a line of {_LONGEST_LINE} characters or more")
+            if line.strip():
+                return line
+        raise StopIteration

@@ -141,6 +141,12 @@ BAD = {
         (),
         "y (--y): got 'y'; accepted is an array of numbers in bad.npz, which holds",
     ),
+    "text": (
+        damaged(u=np.full(6 * N, "1.5")),
+        (),
+        "u (--u): no numbers under 'u' in bad.npz, expected an array of them",
+    ),
+    "nothing": ({}, (), "accepted is an array of numbers in bad.npz, which holds nothing"),
     "nan": (damaged(y=np.full(6 * N, np.nan)), (), "y (--y): 12000 samples are NaN or infinite"),
     "constant": (damaged(u=np.ones(6 * N)), (), "u (--u): constant (1 V)"),
     "one period": (

@@ -3,6 +3,7 @@
 
 import io
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -102,6 +103,19 @@ def test_a_header_without_numbers_is_refused_in_one_line(tmp_path):
 def test_numbers_are_no_names_of_columns(tmp_path):
     (tmp_path / "a.csv").write_text("0.1,1.0e-2\n0.2,2.0e-2\n")
     with pytest.raises(ValueError, match="its first line holds numbers.*expected a header line"):
+        read_arrays(tmp_path / "a.csv", NAMES)
+
+
+@pytest.mark.parametrize(
+    ("row", "reason"),
+    [
+        ("0.1,abc", "line 5: could not convert string 'abc' to float64"),
+        ("0.1", "line 5: the number of columns changed from 2 to 1"),
+    ],
+)
+def test_a_wrong_row_is_named_by_its_line_in_the_file(tmp_path, row, reason):
+    (tmp_path / "a.csv").write_text(f"u,y\n\n0.1,1\n0.2,2\n{row}\n0.3,4\n")
+    with pytest.raises(ValueError, match=re.escape(f"a.csv: no .csv record ({reason}); expected a header")):
         read_arrays(tmp_path / "a.csv", NAMES)
 
 

@@ -287,10 +287,13 @@ def _harmonics(values: npt.ArrayLike | None, n: int) -> IntArray | None:
         return None
     array = np.asarray(values).ravel()
     last = (n - 1) // 2
-    integral = array.dtype.kind in "iuf" and np.all(np.mod(array, 1) == 0)
-    if not integral or array.size == 0 or array.min() < 1 or array.max() > last:
+    wrong = array
+    if array.dtype.kind in "iuf":
+        wrong = array[~((np.mod(array, 1) == 0) & (array >= 1) & (array <= last))]
+    if wrong.size or not array.size:
+        more = "..." if wrong.size > 5 else ""
         raise ValueError(
-            f"excited_harmonics: {array[:5]}..., expected whole numbers from 1 to {last}"
+            f"excited_harmonics: {wrong[:5]}{more}, expected whole numbers from 1 to {last}"
         )
     return np.unique(array.astype(np.int64))
 
@@ -331,7 +334,9 @@ def read_recording(
     fields, names = read_arrays(path, {u, y, *_FIELDS})
     for option, name in (("u", u), ("y", y)):
         present = isinstance(name, str) and name in fields
-        held = cut(", ".join(sorted(names)))  # names may be damaged too
+        held = cut(", ".join(sorted(names))) or "nothing"  # names may be damaged too
+        if not present and name in names:
+            raise ValueError(f"{option}: no numbers under {name!r} in {path.name}, expected an array of them")
         require(present, option, name, f"an array of numbers in {path.name}, which holds {held}")
     for name in sorted({*_FIELDS}.intersection(names) - fields.keys()):
         raise ValueError(f"{name}: no numbers in {path.name}, expected numbers, or no such field")

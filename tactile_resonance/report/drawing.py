@@ -296,7 +296,7 @@ def draw_steps(axes: Axes, steps: Sequence[SmallestStep]) -> None:
     """Steps by what scatters, after one block and without noise, against those of paper and finger."""
     axes.set(ylabel="smallest step [% w/w]", title="Separated at 99 %")
     if not steps:
-        axes.text(0.5, 0.5, "names hold no concentrations", transform=axes.transAxes, ha="center")
+        axes.text(0.5, 0.5, "no two concentrations in the names", transform=axes.transAxes, ha="center")
         return
     names = list(steps[0].one_block)
     for k, step in enumerate(steps):

@@ -71,9 +71,11 @@ def test_single_precision_is_not_copied():
         ({"y": np.ma.masked_greater(Y, 0.5)}, "y: .* samples are NaN or infinite"),
         ({"u": np.array(["a"] * 24)}, "u: values of type"),
         ({"u": U * 1j}, "u: values of type complex"),
-        ({"excited_harmonics": [0, 1]}, "excited_harmonics"),
-        ({"excited_harmonics": [1.5]}, "excited_harmonics"),
-        ({"excited_harmonics": [3]}, "excited_harmonics"),
+        ({"excited_harmonics": [0, 1]}, r"excited_harmonics: \[0\], expected whole numbers from 1 to 2"),
+        ({"excited_harmonics": [1.5]}, r"excited_harmonics: \[1\.5\], expected"),
+        ({"excited_harmonics": [1, 2, 3]}, r"excited_harmonics: \[3\], expected"),
+        ({"excited_harmonics": range(1, 10)}, r"excited_harmonics: \[3 4 5 6 7\]\.\.\., expected"),
+        ({"excited_harmonics": []}, r"excited_harmonics: \[\], expected"),
     ],
 )
 def test_bad_input_names_field_and_value(change, message):

@@ -214,6 +214,7 @@ def test_a_run_may_grow_while_its_bins_are_made(tmp_path):
 
 
 def test_what_it_refuses(runs, tmp_path, capsys):
+    none = [str(tmp_path / "none")]
     cases = {
         "cannot be read as a run": [str(tmp_path)],
         "nowhere cannot be read as a run": [str(tmp_path / "nowhere")],
@@ -223,7 +224,7 @@ def test_what_it_refuses(runs, tmp_path, capsys):
         "order: 0": [str(runs[0]), "--order", "0"],
         "holds 4 excited lines": [str(runs[0]), "--band", "249", "259"],
         "RUN: got": [str(runs[0]), str(runs[0]), "--output", str(tmp_path / "twice")],
-        "no point to identify: ": [str(runs[0]), "--band", "1", "2", "--output", str(tmp_path / "none")],
+        "point 1: no excited line in 1-2 Hz": [str(runs[0]), "--band", "1", "2", "--output", *none],
     }
     for text, arguments in cases.items():
         assert main(["reidentify", *arguments]) == 1
