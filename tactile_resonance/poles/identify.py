@@ -233,7 +233,8 @@ def _judged(
     of_fit, fit = plan.fit(lines.data)
     residual = fit.residual[:, 0]
     plain = 0.5 * fit.marginal[:, 0]  # where the variance of each line is the one weighted with
-    covariance = plain * known.information_correction[:, None, None]
+    wider = known.information_correction * lines.noise_at_modes(of_fit, fit)
+    covariance = plain * wider[:, None, None]
     total = covariance if lines.total_known else None
     if lines.noise is not None:
         covariance = of_fit.propagated(fit, lines.data, lines.noise)

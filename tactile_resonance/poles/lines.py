@@ -17,6 +17,7 @@ from scipy import special
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles import likelihood
+from tactile_resonance.poles.compiled import entry
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     DenseSolution,
@@ -69,13 +70,89 @@ class WeightedLines:
         Whether the variance is of noise and distortion.
     noise : (batch, F) float or None
         Variance from noise alone, where it is known as well then.
+    sample : BinData
+        As `data`, with the variances of each line as they were given.
     """
 
     data: BinData
     known: VarianceModel
     level_known: BoolArray
+    sample: BinData
     total_known: bool = False
     noise: FloatArray | None = None
+
+    def noise_at_modes(self, plan: LinesPlan, solution: Solution) -> FloatArray:
+        """(batch,) factor of the covariance of a fit; see `VarianceModel.at_modes`."""
+        if not (self.known.kind < 2).any():
+            return np.ones(len(self.data.y))
+        theta, problem = solution.theta[:, 0], plan.problem
+        poles = plan.poles_in_band(theta)
+        sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)[1]  # (batch, places, a)
+        taken = sensitivity @ solution.marginal[:, 0, : sensitivity.shape[-1]]
+        phase = np.empty(0) if plan._delay_phase is None else plan._delay_phase
+        basis_a, basis_b, _ = problem.driven_bases
+        return self.known.at_modes(*_at_modes(taken, theta, basis_a, basis_b, phase, self.data, self.sample))
+
+
+@entry
+def _at_modes(taken, theta, basis_a, basis_b, phase, data, sample):
+    """Of the lines that poles are known from, the mean ratio of a sample's variance to that of the data.
+
+    And the sum of the squares of their shares in the variance, both (points, places, 2) for the real and the
+    imaginary part. `taken` (points, places, n) are the derivatives of poles by the gradient of the cost, of
+    coefficients theta (points, n) over the bases; `phase` (K,) is that of a unit of delay, if there is one.
+    """
+    points, places, n = taken.shape
+    bins, a, b = basis_a.shape[0], basis_a.shape[1] - 1, basis_b.shape[1]
+    ratios, squares = np.empty((points, places, 2)), np.empty((points, places, 2))
+    share, ratio, slope = np.empty((places, 2, bins)), np.empty(bins), np.empty(n, np.complex128)
+    for point in range(points):
+        same = min(point, data.u.shape[0] - 1)
+        for k in range(bins):
+            of_a, of_b = basis_a[k, a], 0j
+            for i in range(a):
+                of_a += theta[point, i] * basis_a[k, i]
+            for i in range(b):
+                of_b += theta[point, a + i] * basis_b[k, i]
+            g = of_b / of_a
+            for i in range(a):
+                slope[i] = -g * basis_a[k, i]
+            for i in range(b):
+                slope[a + i] = basis_b[k, i]
+            if phase.size:
+                slope[n - 1] = -1j * phase[k] * of_b
+                g *= np.exp(-1j * phase[k] * theta[point, n - 1])
+            variance, ratio[k] = data.variance_y[point, k], sample.variance_y[point, k]
+            if data.variance_u.shape[1] > 0:
+                power = g.real * g.real + g.imag * g.imag
+                variance += data.variance_u[point, k] * power
+                ratio[k] += sample.variance_u[point, k] * power
+            if data.covariance_yu.shape[1] > 0:
+                variance -= 2 * (data.covariance_yu[point, k] * g.conjugate()).real
+                ratio[k] -= 2 * (sample.covariance_yu[point, k] * g.conjugate()).real
+            used, u = variance < np.inf, data.u[same, 0, k]
+            weight = 0.0
+            if used:
+                weight = (u.real * u.real + u.imag * u.imag) / (of_a.real * of_a.real + of_a.imag * of_a.imag)
+                weight /= variance
+            ratio[k] = ratio[k] / variance if used else 0.0
+            for place in range(places):
+                re, im = 0j, 0j
+                for i in range(n):
+                    re += taken[point, place, i].real * slope[i]
+                    im += taken[point, place, i].imag * slope[i]
+                share[place, 0, k] = weight * (re.real * re.real + re.imag * re.imag)
+                share[place, 1, k] = weight * (im.real * im.real + im.imag * im.imag)
+        for place in range(places):
+            for part in range(2):
+                total = mean = square = 0.0
+                for k in range(bins):
+                    value = share[place, part, k]
+                    total += value
+                    mean += value * ratio[k]
+                    square += value * value
+                ratios[point, place, part], squares[point, place, part] = mean / total, square / (total * total)
+    return ratios, squares
 
 
 def lines_of_frf(frf: FRF) -> WeightedLines:
@@ -105,10 +182,12 @@ def lines_of_frf(frf: FRF) -> WeightedLines:
         bins = (frf.periods - 1) * frf.realisations
         known = replace(known, independent_dof=min(frf.dof, bins))
     noise = frf.variance_noise
+    data = BinData.of(g[:, None], np.ones((1, 1, g.shape[1])), variance_y=weights)
     return WeightedLines(
-        BinData.of(g[:, None], np.ones((1, 1, g.shape[1])), variance_y=weights),
+        data,
         known,
         level_known,
+        data.weighted(variance_y=np.where(usable, variance, 1.0)),
         frf.variance_total is not None,
         None if noise is None or frf.variance_total is None else noise.reshape(flat_shape),
     )
@@ -145,23 +224,22 @@ def lines_of_spectra(
     known = replace(known, kind=np.where(varies, 2, known.kind))
     together = known.kind[:, None] < 2
     correlation /= np.maximum(known.lines[:, None], np.abs(correlation))  # 1 at most
+    sample = c_yy, c_uu, c_yu
     c_yu = np.where(together, correlation * both, c_yu)
     c_yy, c_uu = (np.where(together, *pair) for pair in ((smooth_y, c_yy), (smooth_u, c_uu)))
     power_y, power_u = (_power(x, usable) for x in (z[:, 0], z[:, 1]))
     # all the noise may be in the input, but weights of start values are from the output's
     c_yy = np.maximum(c_yy, LEAST_OUTPUT_NOISE * c_uu * power_y / power_u)
     c_yy = np.where(level_known[:, None], c_yy, power_y)
-    return WeightedLines(
-        BinData.of(
-            z[:, :1],
-            z[:, 1:],
-            variance_y=np.where(usable, c_yy, np.inf),
-            variance_u=c_uu,
-            covariance_yu=c_yu,
-        ),
-        known,
-        level_known,
+    data = BinData.of(
+        z[:, :1],
+        z[:, 1:],
+        variance_y=np.where(usable, c_yy, np.inf),
+        variance_u=c_uu,
+        covariance_yu=c_yu,
     )
+    names = ("variance_y", "variance_u", "covariance_yu")
+    return WeightedLines(data, known, level_known, data.weighted(**dict(zip(names, sample, strict=True))))
 
 
 def _channel(variance: FloatArray, usable: BoolArray, dof: int, pooled: bool) -> VarianceModel:

@@ -90,6 +90,28 @@ def test_a_correlation_that_turns_over_the_band_is_not_taken_from_all_of_it(dof)
     assert result.has_status(PolesStatus.OK).mean() > 0.98
 
 
+@pytest.mark.parametrize(("dof", "larger"), [(1, 10.0), (3, 2.0), (9, 1.5)])
+@pytest.mark.parametrize("given", ["frf", "spectra"])
+def test_noise_at_the_mode_is_seen_where_no_test_of_all_lines_sees_it(given, dof, larger):
+    """Ellipses from a variance pooled over the band held the mode in 70 to 91 %."""
+    rng = np.random.default_rng(9)
+    variance = 1e-5 * (1 + larger * np.abs(G - 0.1) ** 2)
+    samples = circular(rng, (dof + 1, RUNS, 41), variance)
+    g = G + samples[0]
+    if given == "frf":
+        sample = np.mean(np.abs(samples[1:]) ** 2, axis=0)
+        result = identify_batch(frf(g=g, variance_noise=sample, noise_dof=dof), structure=BARE)
+    else:
+        of_u = circular(rng, (dof + 1, RUNS, 41), 1e-9)
+        noise = np.stack([samples, of_u], axis=-2)[1:]
+        covariance = np.einsum("krif,krjf->rijf", noise, noise.conj()) / dof
+        z = np.stack([g, 1 + of_u[0]], axis=-2)
+        result = identify_spectra(LINES_HZ, z, covariance, dof, structure=BARE)
+    flat = result.variance_model == "flat"
+    inside = judge(errors_of(result)[flat], result.covariance[flat, 0], np.eye(2))[1]
+    assert stats.binom.cdf(inside * flat.sum(), flat.sum(), 0.94) > 0.0005
+
+
 def test_level_from_the_residuals_of_few_lines_is_not_too_small():
     """Five parameters take 2.5 of nine complex residuals: ignored, the level is 28 % low.
 
@@ -105,7 +127,10 @@ def test_level_from_the_residuals_of_few_lines_is_not_too_small():
 
 
 def test_a_pooled_level_of_few_degrees_of_freedom_widens_the_ellipse():
-    """Nine lines of one degree each: errors are Student distributed, of variance 9/8 if that were ignored."""
+    """Nine lines of one degree each: errors are Student distributed, of variance 9/8 if that were ignored.
+
+    Chance makes the samples at the mode larger than the others, too, which adds up to a tenth.
+    """
     rng, runs = np.random.default_rng(4), 6000
     g = G[FEW] + circular(rng, (runs, 9), 1e-6)
     sample = 1e-6 * rng.gamma(1, 1, (runs, 9))
@@ -115,7 +140,8 @@ def test_a_pooled_level_of_few_degrees_of_freedom_widens_the_ellipse():
     flat = result.variance_model == "flat"
     assert flat.mean() > 0.999
     squared = (errors_of(result) ** 2 / variances(result.covariance))[flat]
-    assert squared.mean() == pytest.approx(1, abs=4 * np.sqrt(2.6 / squared.size))
+    scatter = 4 * np.sqrt(2.6 / squared.size)
+    assert 0.9 - scatter < squared.mean() < 1 + scatter
 
 
 def assert_rate(alarms, rate):
