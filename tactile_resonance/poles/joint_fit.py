@@ -20,7 +20,7 @@ from tactile_resonance.poles.data import BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
-from tactile_resonance.poles.levels import Levels, Spread, level_of
+from tactile_resonance.poles.levels import Levels, Spread, level_of, noise_at_modes
 from tactile_resonance.poles.likelihood import Solution, moments
 from tactile_resonance.poles.model_error import are_smooth, systematic_of
 from tactile_resonance.poles.noise_level import (
@@ -294,6 +294,10 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     lack = lack.only_where(doubted & ~suspect)
     # others are fitted once more
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
+    rows = np.flatnonzero((fitted.kind > 0) & _may_return(solution))
+    if rows.size and data.undriven:  # one level for all bins, where they are flat, is known well enough
+        at = data.rows(rows), solution.rows(rows), scale[rows]
+        correction[rows] *= noise_at_modes(plan, *at)
     # real and imaginary part of a circular complex error have half its variance each
     covariance = inverse * (0.5 * scale * correction)[:, None, None]
     known = plan.level_known

@@ -28,6 +28,7 @@ from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.noise_level import (
     Pieces,
+    at_modes,
     is_rare,
     moments_of_ratio,
     student_variance,
@@ -99,6 +100,51 @@ def level_of(
         correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
     scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
     return scale, cost, expected, suspect, noise * level[:, None], correction
+
+
+def noise_at_modes(plan: JointPlan, data: BinData, solution: Solution, scale: FloatArray) -> FloatArray:
+    """(batch,) factor of the covariance of points of one record each; see `noise_level.at_modes`.
+
+    Each undriven bin shows the noise there, and those beside a driven one the noise on it.
+
+    Parameters
+    ----------
+    plan : JointPlan
+    data : BinData
+        With undriven bins.
+    solution : Solution
+    scale : (batch,) float
+        Level of the noise in units of the variances of the data.
+    """
+    problem, first = plan.problem, data.undriven
+    (a, b, _), theta, inverse = problem.sizes, solution.theta[:, 0], solution.marginal[:, 0]
+    alpha, beta, gamma = problem.split(theta)
+    of_a = alpha @ problem.denominator.T  # (batch, K), the undriven bins first
+    u, numerator = np.array(data.u[:, 0, data.order]), np.zeros((data.order.size, b), complex)
+    u[:, :first], numerator[first:] = 0, problem.numerator
+    model = (u * (beta @ numerator.T) + gamma @ problem.transient.T) / of_a
+    variance, weighted = data.residual_variance(problem.response(theta)), data.variance
+    own = problem.transient[:first] / of_a[:, :first, None]
+    taken = np.einsum("bki,bij,bkj->bk", own.conj(), inverse[:, a + b :, a + b :], own).real
+    free = np.maximum(1 - taken / (2 * weighted[:, :first]), 0.2)  # of a bin, less what the transient takes
+    sample = np.abs(data.y[:, 0, data.order[:first]] - model[:, :first]) ** 2 / free / scale[:, None]
+    each = first / plan.excited_at.size
+    away = np.abs(plan.excited_at[:, None] - plan.others_at)
+    beside = np.argsort(away, axis=1, kind="stable")[:, : max(2, 2 * round(each / 2))]
+    beyond = sample[:, beside].mean(axis=-1) - weighted[:, first:]  # what is on Y alone
+    ratio = np.concatenate([sample / weighted[:, :first], 1 + beyond / variance], axis=-1)
+    weighted[:, first:] = variance
+    poles = plan.poles_in_band(theta)
+    sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)[1]
+    moved = sensitivity @ inverse[:, :a]
+    moved = np.stack([moved.real, moved.imag], axis=2)  # (batch, places, 2, n)
+    by_bin = (moved[..., a : a + b] @ numerator.T) * u[:, None, None]
+    by_bin = by_bin + moved[..., a + b :] @ problem.transient.T
+    by_bin = by_bin - (moved[..., :a] @ problem.denominator[:, :a].T) * model[:, None, None]
+    share = np.abs(by_bin) ** 2 / (np.abs(of_a) ** 2 * weighted)[:, None, None]
+    share /= share.sum(axis=-1, keepdims=True)
+    squares = (share[..., :first] ** 2).sum(axis=-1) + (share[..., first:] ** 2).sum(axis=-1) / each
+    return at_modes((share * ratio[:, None, None]).sum(axis=-1), 1 / squares)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from tactile_resonance.poles.fit import (
 )
 from tactile_resonance.poles.likelihood import Rules, Solution
 from tactile_resonance.poles.model import RationalModel
-from tactile_resonance.poles.noise_level import FALSE_ALARM, VarianceModel, model_variance
+from tactile_resonance.poles.noise_level import FALSE_ALARM, VarianceModel, at_modes, model_variance
 from tactile_resonance.poles.starts import (
     SEVERAL_MODES,
     best_of_split,
@@ -82,8 +82,9 @@ class WeightedLines:
     noise: FloatArray | None = None
 
     def noise_at_modes(self, plan: LinesPlan, solution: Solution) -> FloatArray:
-        """(batch,) factor of the covariance of a fit; see `VarianceModel.at_modes`."""
-        if not (self.known.kind < 2).any():
+        """(batch,) factor of the covariance of a fit; see `noise_level.at_modes`."""
+        known = self.known
+        if not (known.kind < 2).any():
             return np.ones(len(self.data.y))
         theta, problem = solution.theta[:, 0], plan.problem
         poles = plan.poles_in_band(theta)
@@ -91,7 +92,9 @@ class WeightedLines:
         taken = sensitivity @ solution.marginal[:, 0, : sensitivity.shape[-1]]
         phase = np.empty(0) if plan._delay_phase is None else plan._delay_phase
         basis_a, basis_b, _ = problem.driven_bases
-        return self.known.at_modes(*_at_modes(taken, theta, basis_a, basis_b, phase, self.data, self.sample))
+        of_modes = _at_modes(taken, theta, basis_a, basis_b, phase, self.data, self.sample)
+        each = known.dof if known.independent_dof is None else known.independent_dof
+        return np.where(known.kind < 2, at_modes(of_modes[0], each / of_modes[1]), 1.0)
 
 
 @entry

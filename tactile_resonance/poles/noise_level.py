@@ -121,27 +121,6 @@ class VarianceModel:
         """(batch,) expectation of ``sum |e|^2 / s^2`` with noise alone; NaN where it has none."""
         return (self.lines - parameters / 2) * student_variance(self.pooled_dof)
 
-    def at_modes(self, ratio: FloatArray, squares: FloatArray) -> FloatArray:
-        """(batch,) factor of covariances for samples that are above a curve over the band where the modes are.
-
-        The test for such a curve is one of all lines: it does not see the noise of the few that a pole is known
-        from. The rarer chance makes what they show, the more it counts.
-
-        Parameters
-        ----------
-        ratio : (batch, places, 2) float
-            Of sample variances to those of the curve, the mean over lines weighted with their shares in the
-            variance of a pole; NaN where there is none.
-        squares : (batch, places, 2) float
-            Sum of the squares of these shares.
-        """
-        each = self.dof if self.independent_dof is None else self.independent_dof
-        dof = each / squares
-        weight = np.maximum(1 - special.gammaincc(dof, dof * ratio) / CHANCE, 0)
-        factor = 1 + weight * np.maximum(ratio * student_variance(np.maximum(dof, 2)) - 1, 0)
-        factor = np.where(np.isfinite(factor) & (self.kind < 2)[:, None, None], factor, 1.0)
-        return np.asarray(factor.max(axis=(1, 2), initial=1.0))
-
     def contradicts(self, cost: FloatArray, parameters: int, probability: float) -> BoolArray:
         """(batch,) whether noise alone exceeds a cost more rarely; False where that cannot be determined."""
         free = np.maximum(self.lines - parameters / 2, 0.5)
@@ -154,6 +133,26 @@ class VarianceModel:
                 above = (cost - free * mean) / (np.sqrt(free) * std)
                 rare |= by_line & (above > -special.ndtri(probability))
         return rare
+
+
+@np.errstate(invalid="ignore")
+def at_modes(ratio: FloatArray, dof: FloatArray) -> FloatArray:
+    """(batch,) factor of covariances for noise above a curve over the band where the modes are.
+
+    The test for such a curve is one of all lines: it does not see the noise of the few that a pole is known
+    from. The rarer chance makes what they show, the more it counts.
+
+    Parameters
+    ----------
+    ratio : (batch, places, 2) float
+        Of sample variances to those of the curve, the mean over lines weighted with their shares in the
+        variance of a pole; NaN where there is none.
+    dof : (batch, places, 2) float
+        Complex degrees of freedom of it: those of a line over the sum of the squares of these shares.
+    """
+    weight = np.maximum(1 - special.gammaincc(dof, dof * ratio) / CHANCE, 0)
+    factor = 1 + weight * np.maximum(ratio * student_variance(np.maximum(dof, 2)) - 1, 0)
+    return np.asarray(np.where(np.isfinite(factor), factor, 1.0).max(axis=(1, 2), initial=1.0))
 
 
 def moments_of_ratio(dof: int) -> tuple[float, float]:

@@ -118,6 +118,20 @@ def test_noise_with_a_peak_at_the_resonance(periods):
     assert cost == pytest.approx(result.expected_cost[by_piece].mean(), rel=0.04)
 
 
+@pytest.mark.parametrize("periods", [2, 3])
+def test_noise_through_a_mode_narrower_than_the_pieces_of_the_band(periods):
+    """As of vibration: of a mean over the bins of a piece ellipses held the mode in 82 to 84 %."""
+    plant = Plant(0.01, 40.0, periods)
+    bins, rng = plant.bins(), np.random.default_rng(7)
+    s, w0 = 2j * np.pi * bins * SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD / periods, 2 * np.pi * 250
+    through = 0.01 + np.abs(0.02 * w0**2 / (s**2 + 0.02 * w0 * s + w0**2)) ** 2
+    y = plant.output(bins) + circular(rng, bins.size, 10 * plant.noise[0] * through)
+    result = fits(plant, plant.input(bins), y)
+    errors = np.stack([result.f0_hz[:, 0] - 250, result.damping_ratio[:, 0] - 0.01], -1)
+    coverage = judge(errors, result.covariance[:, 0], np.eye(2))[1]
+    assert stats.binom.cdf(coverage * RUNS, RUNS, 0.925) > 0.0005
+
+
 def test_a_level_from_few_lines_widens_the_ellipse():
     """One period, nine lines: a level of 5.5 complex degrees of freedom; ignored it costs 3 % of coverage."""
     plant, band_hz, runs = Plant(0.02, 40.0, 1), (240.0, 260.0), 4000
