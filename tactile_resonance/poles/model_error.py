@@ -266,10 +266,12 @@ def difference_of_models(
     Returns
     -------
     (..., places, 2, 2) float
-        With the covariance of the nearest one; NaN where the richer model has or determines no mode.
+        With the covariance of the nearest one; NaN where the richer model has no mode, or knows it no better
+        than to half the width of the pole.
     """
     distance = np.abs(richer_rad_s[..., None, :] - poles_rad_s[..., None])  # (..., places, more)
     nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
     other = np.take_along_axis(richer_rad_s, nearest, axis=-1)
-    moved = difference_of_halves(poles_rad_s, other)
-    return np.asarray(moved + np.take_along_axis(covariance, nearest[..., None, None], axis=-3))
+    own = np.take_along_axis(covariance, nearest[..., None, None], axis=-3)
+    known = own[..., :1, :1] < (poles_rad_s.real / (2 * np.pi))[..., None, None] ** 2
+    return np.where(known, difference_of_halves(poles_rad_s, other) + own, np.nan)

@@ -189,6 +189,22 @@ def test_two_modes_taken_for_one_are_within_the_total_covariance(distance_hz, sh
     assert np.median(nearest) > 0.3  # nor is everything within it
 
 
+def test_a_richer_model_that_determines_nothing_does_not_make_the_total_covariance():
+    """Two modes 2 Hz apart: of 30 model errors, one had a deviation of f0 of up to hundreds of hertz."""
+    lines_hz = np.linspace(200, 300, 41)
+    s, w0 = 2j * np.pi * lines_hz, 2 * np.pi * np.array([[250.0], [252.0]])
+    g = 0.1 + np.sum(0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2), axis=0)
+    g = g + 0.01 * np.random.default_rng(2).standard_normal((400, 41, 2)).view(complex)[..., 0] / np.sqrt(2)
+    result = identify_batch(FRF(lines_hz, g, variance_noise=np.full(41, 1e-4), noise_dof=50))
+    told = result.has_status(PolesStatus.MODEL_ERROR)
+    assert told.sum() > 40
+    std_hz = np.sqrt(result.total_covariance[told, 0, 0, 0])
+    half_width_hz = np.abs(result.poles_rad_s[told, 0].real) / (2 * np.pi)
+    assert np.all(std_hz < 2 * half_width_hz)
+    off_hz = np.abs(result.f0_hz[told] - [250.0, 252.0]).min(axis=-1)
+    assert np.mean(off_hz < 1.96 * std_hz) > 0.95
+
+
 def test_one_wild_line_is_within_the_total_covariance():
     """Any one line of the band, three thousand deviations off: a cost beyond noise widens the ellipse."""
     plant = Plant(0.02, 60.0, 2)
