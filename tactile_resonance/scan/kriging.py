@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A quantity between its points: Gaussian process regression (kriging) with the noise of each point.
 
-Ordinary kriging: an unknown constant mean and a Matern covariance of smoothness 5/2, whose length and size
-are those of greatest restricted likelihood (Rasmussen and Williams, Gaussian Processes for Machine Learning,
-2006, chapters 2, 4 and 5). Few points determine these badly: there what is known is a mixture over the lengths
-and sizes that they allow, each with its likelihood, no logarithm of either preferred beforehand (Handcock and
-Stein, Technometrics 35, 1993).
+Ordinary kriging: an unknown constant mean, a Matern covariance of smoothness 5/2, and a scatter from place to
+place, independent at any two, that is part of the quantity and not of the noise (nugget effect: Chiles and
+Delfiner, Geostatistics, 2012). Length, size and scatter are those of greatest restricted likelihood (Rasmussen
+and Williams, Gaussian Processes for Machine Learning, 2006, chapters 2, 4 and 5). Few points determine these
+badly: there what is known is a mixture over those that they allow, each with its likelihood, no logarithm of
+either preferred beforehand (Handcock and Stein, Technometrics 35, 1993).
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cholesky, lapack, solve_triangular
-from scipy.optimize import minimize, minimize_scalar
+from scipy.linalg import cholesky, eigh, lapack, solve_triangular
+from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -37,21 +38,25 @@ _BLOCK = 40
 MOST_JOINT = 1000
 _NEIGHBOURS, _ALONG = 300, 12  # of a tile; tiles along the longer side
 MIXED_POINTS = 40
-"""Up to so many points the uncertainty of length and size counts: of more it adds less than a tenth."""
-# Of the mixture: steps of the logarithm of the length; sizes in standard deviations of theirs; least share of
-# the largest.
-_LENGTH_STEP, _SIZE_STEPS, _LEAST_SHARE = 0.7, (-1.3, 0, 1.3, 2.6), 0.1
+"""Up to so many points the uncertainty of length, size and scatter counts: of more it adds little."""
+# Of the mixture: steps of the logarithms of length and size; sizes in standard deviations of theirs; least
+# share of the largest; scatters over that of the values.
+_LENGTH_STEP, _SIZE_STEP, _SIZE_STEPS, _LEAST_SHARE = 0.7, 0.25, (-1.3, 0, 1.3, 2.6), 0.1
+_SCATTERS = np.exp(-0.5 - np.arange(5))
+_LEAST_SCATTER = 0.3  # of the median noise; less is not looked for
 # Of the variance of the process; below it neighbours are too much alike to invert their covariance.
 _JITTER = 1e-10
 
 
 class Process(NamedTuple):
-    """A process of one length and size, with the points known.
+    """A process of one length, size and scatter, with the points known.
 
     Attributes
     ----------
     xy_m : (n, 2) float
     length_m, std : float
+    scatter : float
+        Standard deviation of what each place has for itself.
     lower : (n, n) float
         Cholesky factor of the covariance of the values.
     mean : float
@@ -66,6 +71,7 @@ class Process(NamedTuple):
     xy_m: FloatArray
     length_m: float
     std: float
+    scatter: float
     lower: FloatArray
     mean: float
     weights: FloatArray
@@ -74,19 +80,21 @@ class Process(NamedTuple):
 
     @classmethod
     def of(
-        cls, xy_m: FloatArray, y: FloatArray, noise: FloatArray, length_m: float, std: float
+        cls, xy_m: FloatArray, y: FloatArray, noise: FloatArray, length_m: float, std: float, scatter: float
     ) -> Process:
         """Of values (n,) with noise."""
         covariance = std**2 * _matern(cdist(xy_m, xy_m) / length_m)
-        lower = np.asarray(cholesky(covariance + np.diag(noise**2 + _JITTER * std**2), lower=True), np.float64)
+        alone = noise**2 + scatter**2 + _JITTER * std**2
+        lower = np.asarray(cholesky(covariance + np.diag(alone), lower=True), np.float64)
         ones, values = _solved(lower, np.stack([np.ones(len(y)), y], axis=1)).T
         known = float(ones @ ones)
         mean = float(ones @ values) / known
         weights = solve_triangular(lower, values - mean * ones, lower=True, trans="T")
-        return cls(xy_m, length_m, std, lower, mean, weights, ones / np.sqrt(known), 1 / np.sqrt(known))
+        of_mean = ones / np.sqrt(known)
+        return cls(xy_m, length_m, std, scatter, lower, mean, weights, of_mean, 1 / np.sqrt(known))
 
     def before(self, a_m: FloatArray, b_m: FloatArray) -> FloatArray:
-        """(p, q) covariance between (p, 2) and (q, 2) positions while no value is known."""
+        """(p, q) covariance between (p, 2) and (q, 2) other positions while no value is known."""
         return np.asarray(self.std**2 * _matern(cdist(a_m, b_m) / self.length_m))
 
     def at(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -99,13 +107,13 @@ class Process(NamedTuple):
         return self.mean + self.weights @ cross, solved, self.mean_std - self.of_mean @ solved
 
     def moments(self, at_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(q,) value and its variance at (q, 2) positions."""
+        """(q,) value and its variance, with the scatter, at (q, 2) positions."""
         value, solved, of_mean = self.at(at_m)
         known = np.einsum("nq,nq->q", solved, solved)
-        return value, np.maximum(self.std**2 - known + of_mean**2, 0)
+        return value, np.maximum(self.std**2 - known + of_mean**2, 0) + self.scatter**2
 
     def covariance(self, a_m: FloatArray, b_m: FloatArray) -> FloatArray:
-        """(p, q) covariance of the quantity between (p, 2) and (q, 2) positions, as `moments` knows it."""
+        """(p, q) covariance of the quantity between (p, 2) and (q, 2) other positions, as known now."""
         (_, solved_a, of_a), (_, solved_b, of_b) = self.at(a_m), self.at(b_m)
         return self.before(a_m, b_m) - solved_a.T @ solved_b + np.outer(of_a, of_b)
 
@@ -117,7 +125,7 @@ class KrigedSurface:
     Attributes
     ----------
     processes : tuple of k
-        Of lengths and sizes that the points allow; one where many points determine these.
+        Of lengths, sizes and scatters that the points allow; one where many points determine these.
     shares : (k,) float
         Their probabilities.
     """
@@ -133,8 +141,8 @@ class KrigedSurface:
     def predict(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(...) value and its standard deviation at (..., 2) positions.
 
-        The standard deviation is that of the quantity itself, not of a new measurement of it; it
-        includes that of the mean and, of up to `MIXED_POINTS` points, of length and size.
+        The standard deviation is that of the quantity at the place, with its scatter, not of a new measurement
+        of it; it includes that of the mean and, of up to `MIXED_POINTS` points, of length, size and scatter.
         """
         at = np.asarray(xy_m, float)
         moments = np.array([process.moments(at.reshape(-1, 2)) for process in self.processes])
@@ -146,13 +154,13 @@ class KrigedSurface:
 
 @dataclass(frozen=True, eq=False)
 class TiledSurface:
-    """A quantity known at many points: `KrigedSurface` tile by tile, of one length and size.
+    """A quantity known at many points: `KrigedSurface` tile by tile, of one length, size and scatter.
 
     Attributes
     ----------
     xy_m : (n, 2) float
     values, noise_std : (n,) float
-    length_m, process_std : float
+    length_m, process_std, scatter : float
     """
 
     xy_m: FloatArray
@@ -160,6 +168,7 @@ class TiledSurface:
     noise_std: FloatArray
     length_m: float
     process_std: float
+    scatter: float
 
     def predict(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """As `KrigedSurface.predict`; the mean is that of each tile's neighbours."""
@@ -175,7 +184,7 @@ class TiledSurface:
             own = tile_of.ravel() == k
             _, near = points.query(flat[own].mean(axis=0), k=_NEIGHBOURS)
             known = self.xy_m[near], self.values[near], self.noise_std[near]
-            part = Process.of(*known, self.length_m, self.process_std)
+            part = Process.of(*known, self.length_m, self.process_std, self.scatter)
             found[:, own] = part.moments(flat[own])
         value, variance = found.reshape(2, *at.shape[:-1])
         return value, np.sqrt(variance)
@@ -186,7 +195,7 @@ def krige_many(
 ) -> KrigedSurface | TiledSurface:
     """`krige` of any number of points; beyond `MOST_JOINT` of them tile by tile.
 
-    Length and size are those of all points.
+    Length, size and scatter are those of all points.
 
     Raises
     ------
@@ -212,11 +221,10 @@ def krige_many(
         y,
         noise,
         np.linspace(lowest, np.log(extent), 4)[1:3],
-        np.log(scale),
         (lowest, highest),
         (np.log(1e-4 * scale), np.log(100 * scale)),
     )
-    return TiledSurface(xy, y, noise, *np.exp(best).tolist())
+    return TiledSurface(xy, y, noise, *best.tolist())
 
 
 def krige(
@@ -226,7 +234,7 @@ def krige(
     most_length_m: float = np.inf,
     least_std: float = 0.0,
 ) -> KrigedSurface:
-    """Fit length, size and mean.
+    """Fit length, size, scatter and mean.
 
     Parameters
     ----------
@@ -234,7 +242,7 @@ def krige(
         Positions, n at least `LEAST_POINTS`, not all in one place.
     values : (n,) float
     noise_std : (n,) float
-        Of each value; 0 means exact.
+        Of each value; 0 means exact, and where one is, a scatter is not looked for.
     most_length_m, least_std : float
         What is known beforehand of length and size, which few points do not determine.
 
@@ -257,16 +265,14 @@ def krige(
     nearest = float(np.median(other.min(axis=1)))
     longest = min(10 * extent, most_length_m)
     lowest, highest = np.log(min(0.3 * nearest, longest)), np.log(longest)
-    least, most = np.log(max(1e-4 * scale, least_std)), np.log(max(100 * scale, least_std))
-    first = min(max(np.log(scale), least), most)
-    # starts over the lengths that the points resolve: a likelihood may have several maxima
-    starts = np.linspace(lowest, min(np.log(extent), highest), 4)
-    best = _fitted(xy, y, noise, starts, first, (lowest, highest), (least, most))
-    at, shares = best[None], np.ones(1)
+    sizes = np.log(max(1e-4 * scale, least_std)), np.log(max(100 * scale, least_std))
     if len(y) <= MIXED_POINTS:
-        lengths = lowest, min(highest, np.log(3 * extent))
-        at, shares = _spread(best, lengths, (least, most), distances, y, noise)
-    processes = tuple(Process.of(xy, y, noise, *each) for each in np.exp(at).tolist())
+        lengths = lowest, max(lowest, min(highest, np.log(3 * extent)))
+        at, shares = _spread(lengths, sizes, distances, y, noise)
+    else:
+        starts = np.linspace(lowest, min(np.log(extent), highest), 4)[1:3]
+        at, shares = _fitted(xy, y, noise, starts, (lowest, highest), sizes)[None], np.ones(1)
+    processes = tuple(Process.of(xy, y, noise, *each) for each in at.tolist())
     return KrigedSurface(processes, shares)
 
 
@@ -299,73 +305,101 @@ def _fitted(
     y: FloatArray,
     noise: FloatArray,
     starts: FloatArray,
-    first: float,
     lengths: tuple[float, float],
     sizes: tuple[float, float],
 ) -> FloatArray:
-    """Logarithms (2,) of length and size of greatest likelihood within bounds, from lengths and a size on."""
+    """Length, size and scatter (3,) of greatest likelihood, from logarithms of lengths on.
+
+    Bounds of length and size are logarithms too.
+    """
     parts = [(cdist(xy[own], xy[own]), y[own], noise[own]) for own in _parts(xy)]
+    scale = _scale(y)
+    size = min(max(np.log(scale), sizes[0]), sizes[1])
+    # where a value is exact there is none; else between what noise hides and the whole
+    hidden = max(0.01 * float(np.median(noise)), 1e-6 * scale)
+    most = max(scale, hidden) if noise.all() else hidden
+    scatters, first = np.log([hidden, most]), np.log(np.sqrt(hidden * most))
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:
         costs, slopes = zip(*(_cost(x, *part) for part in parts), strict=True)
         return sum(costs), np.sum(slopes, axis=0)
 
+    bounds = [lengths, sizes, scatters]
     found = (
-        minimize(cost, np.array([start, first]), jac=True, method="L-BFGS-B", bounds=[lengths, sizes])
+        minimize(cost, np.array([start, size, first]), jac=True, method="L-BFGS-B", bounds=bounds)
         for start in starts
     )
-    return np.asarray(min(found, key=lambda each: each.fun).x)
+    return np.exp(min(found, key=lambda each: each.fun).x)
 
 
 def _spread(
-    best: FloatArray,
     lengths: tuple[float, float],
     sizes: tuple[float, float],
     distances: FloatArray,
     y: FloatArray,
     noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Logarithms (k, 2) of length and size about the best, within bounds, and their probabilities (k,)."""
-    steps = np.arange(-20, 21) * _LENGTH_STEP + best[0]
-    inside = (steps >= lengths[0]) & (steps <= lengths[1])
-    inside[20] = True  # the best itself
+    """Lengths, sizes and scatters (k, 3) that points allow, and their probabilities (k,).
+
+    Bounds of length and size are logarithms. No scatter, and each that is looked for, are as probable
+    beforehand.
+    """
+    scale = _scale(y)
+    scatters = np.append(0.0, scale * _SCATTERS)
+    looked_for = noise.all() & (scatters > _LEAST_SCATTER * np.median(noise))
+    looked_for[0] = True
+    log_size, step = np.linspace(*sizes, max(3, math.ceil((sizes[1] - sizes[0]) / _SIZE_STEP)), retstep=True)
+    least_std = 1 / np.sqrt(2 * (len(y) - 1))
     at, log_share = [], []
-    for log_length in steps[inside]:
-
-        def cost(log_size: float, log_length: float = log_length) -> tuple[float, FloatArray]:
-            return _cost(np.array([log_length, log_size]), distances, y, noise)
-
-        found = minimize_scalar(
-            lambda size, cost=cost: cost(size)[0], bounds=sizes, method="bounded", options={"xatol": 0.05}
-        )
-        middle = float(found.x)
-        # half of the chi-square of the values where they are exact, wider where noise hides the size
-        step = 1 / np.sqrt(2 * (len(y) - 1))
-        bend = (cost(middle + step)[1][1] - cost(middle - step)[1][1]) / (2 * step)
-        std = 1 / np.sqrt(min(max(bend, 1.0), 1 / step**2))
-        for k in _SIZE_STEPS:
-            log_size = middle + k * std
-            if sizes[0] <= log_size <= sizes[1]:
-                at.append((log_length, log_size))
-                log_share.append(np.log(std) - cost(log_size)[0])
+    for log_length in np.linspace(*lengths, math.ceil((lengths[1] - lengths[0]) / _LENGTH_STEP) + 1):
+        correlation = _matern(distances / np.exp(log_length))
+        for scatter in scatters[looked_for]:
+            likelihood = _log_likelihoods(np.exp(log_size), correlation, y, np.hypot(noise, scatter))
+            middle = int(np.argmax(likelihood))
+            inner = min(max(middle, 1), len(log_size) - 2)
+            # half of the chi-square of the values where they are exact, wider where noise hides the size
+            bend = -np.diff(likelihood[inner - 1 : inner + 2], 2)[0] / step**2 if step else 0.0
+            std = 1 / np.sqrt(min(max(bend, 1.0), 1 / least_std**2))
+            for k in _SIZE_STEPS:
+                size = log_size[middle] + k * std
+                if sizes[0] <= size <= sizes[1]:
+                    at.append((np.exp(log_length), np.exp(size), scatter))
+                    log_share.append(np.log(std) + np.interp(size, log_size, likelihood))
     share = np.exp(np.array(log_share) - max(log_share))
     kept = share > _LEAST_SHARE
     return np.array(at)[kept], share[kept] / share[kept].sum()
 
 
+def _log_likelihoods(
+    sizes: FloatArray, correlation: FloatArray, y: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """(s,) logarithm of the restricted likelihood of sizes (s,), but for a constant.
+
+    All from the eigenvalues of the correlation over noise.
+    """
+    weight = 1 / np.maximum(noise, np.sqrt(_JITTER) * _scale(y))
+    value, vector = eigh(weight[:, None] * correlation * weight, check_finite=False, driver="evd")
+    ones, values = vector.T @ weight, vector.T @ (weight * (y - y.mean()))
+    variance = 1 + sizes[:, None] ** 2 * np.maximum(value, 0)
+    known, cross, square = (np.sum(v / variance, axis=1) for v in (ones**2, ones * values, values**2))
+    log_volume = np.sum(np.log(variance), axis=1) - 2 * np.sum(np.log(weight)) + np.log(known)
+    return np.asarray(-0.5 * (square - cross**2 / known + log_volume))
+
+
 def _cost(
     x: FloatArray, distances: FloatArray, y: FloatArray, noise: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Minus the logarithm of the restricted likelihood, but for a constant, and its (2,) derivatives.
+    """Minus the logarithm of the restricted likelihood, but for a constant, and its (3,) derivatives.
 
-    By a parameter that changes the covariance C by C' they are half the sum of ``G C'`` over all elements, with
-    ``G = C^-1 - w w^T / (1^T w) - a a^T``, ``w = C^-1 1`` and ``a = C^-1 (y - mean)``.
+    By logarithms of length, size and scatter. By a parameter that changes the covariance C by C' they are half
+    the sum of ``G C'`` over all elements, with ``G = C^-1 - w w^T / (1^T w) - a a^T``, ``w = C^-1 1`` and
+    ``a = C^-1 (y - mean)``.
     """
-    length, size = np.exp(x).tolist()
+    length, size, scatter = np.exp(x).tolist()
     scaled = np.sqrt(5) * distances / length
     decay = size**2 * np.exp(-scaled)
     process = (1 + scaled + scaled**2 / 3) * decay + np.diag(np.full(len(y), _JITTER * size**2))
-    lower, failed = lapack.dpotrf(process + np.diag(noise**2), lower=True)
+    lower, failed = lapack.dpotrf(process + np.diag(noise**2 + scatter**2), lower=True)
     if failed:
         raise np.linalg.LinAlgError("the covariance of the values is not positive definite")
     solved, _ = lapack.dpotrs(lower, np.stack([np.ones(len(y)), y], axis=1), lower=True)
@@ -378,8 +412,9 @@ def _cost(
     slope = inverse - np.outer(weights, weights) / known - np.outer(gap, gap)
     by_length = np.sum(slope * scaled**2 * (1 + scaled) / 3 * decay)
     by_size = 2 * np.sum(slope * process)
+    by_scatter = 2 * scatter**2 * np.trace(slope)
     cost = 0.5 * ((y - mean) @ gap + log_volume)
-    return float(cost), np.array([by_length, by_size]) / 2
+    return float(cost), np.array([by_length, by_size, by_scatter]) / 2
 
 
 def _solved(lower: FloatArray, right: FloatArray) -> FloatArray:

@@ -66,7 +66,10 @@ def test_equal_values_are_that_value_everywhere(noise):
 
 @pytest.mark.parametrize("noise", [0.05, 0.7])
 def test_coverage_is_honest(noise):
-    """Seeded Monte Carlo over processes: errors in stated standard deviations have mean square near 1."""
+    """Seeded Monte Carlo over processes: errors in stated standard deviations have mean square 1 or less.
+
+    Less, for 36 points do not show that nothing scatters from place to place.
+    """
     rng, runs, count = np.random.default_rng(4), 60, 36
     grid = np.stack(np.meshgrid(*[np.linspace(0, 0.02, 6)] * 2), axis=-1).reshape(-1, 2)
     errors = []
@@ -79,8 +82,27 @@ def test_coverage_is_honest(noise):
     errors = np.array(errors)
     per_run = np.mean(errors**2, axis=1)
     standard_error = per_run.std() / np.sqrt(runs)
-    assert abs(per_run.mean() - 1) < 4 * standard_error
-    assert 0.92 < np.mean(np.abs(errors) < 1.96) < 0.98
+    assert 0.5 < per_run.mean() < 1 + 4 * standard_error
+    assert np.mean(np.abs(errors) < 1.96) > 0.92
+
+
+@pytest.mark.parametrize(("side", "runs", "least"), [(4, 40, 0.88), (6, 30, 0.72), (8, 20, 0.85), (33, 1, 0.9)])
+def test_what_scatters_from_place_to_place_is_in_the_band(side, runs, least):
+    """Seeded Monte Carlo of a bump of 3 Hz with 0.2 Hz of scatter, noise 0.02 Hz: the next place's value.
+
+    By noise and a smooth field alone 0.45 to 0.8 of them lie in the band of 95 %.
+    """
+    rng, n, within = np.random.default_rng(12), side**2, []
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.01, 0.01, side)] * 2), axis=-1).reshape(-1, 2)
+    for _ in range(runs):
+        at = rng.uniform(-0.01, 0.01, (50, 2))
+        middle, width = rng.uniform(-0.003, 0.003, 2), rng.uniform(0.003, 0.005)
+        off = np.sum((np.concatenate([grid, at]) - middle) ** 2, axis=1)
+        truth = 254 + 3 * np.exp(-off / (2 * width**2)) + 0.2 * rng.standard_normal(n + 50)
+        noise = np.full(n, 0.02)
+        value, std = krige_many(grid, truth[:n] + noise * rng.standard_normal(n), noise).predict(at)
+        within.append(np.mean(np.abs(value - truth[n:]) < 1.96 * std))
+    assert least < np.mean(within) < 0.99
 
 
 @pytest.mark.parametrize(("length_m", "least"), [(0.006, 0.89), (0.015, 0.92)])
@@ -94,7 +116,7 @@ def test_of_nine_points_the_uncertainty_of_length_and_size_counts(length_m, leas
         surface = krige(grid, truth[:9] + 0.05 * rng.standard_normal(9), np.full(9, 0.05))
         value, std = surface.predict(at)
         errors.append((value - truth[9:]) / std)
-    assert least < np.mean(np.abs(errors) < 1.96) < 0.99
+    assert least < np.mean(np.abs(errors) < 1.96) < 1
 
 
 def test_a_mixture_has_the_moments_of_its_processes():
@@ -108,7 +130,7 @@ def test_a_mixture_has_the_moments_of_its_processes():
     assert np.sum(surface.shares) == pytest.approx(1)
     draws = []
     for share, process in zip(surface.shares, surface.processes, strict=True):
-        mean, covariance = process.moments(at)[0], process.covariance(at, at)
+        mean, covariance = process.moments(at)[0], process.covariance(at, at) + process.scatter**2 * np.eye(3)
         draws.append(rng.multivariate_normal(mean, covariance, round(4e5 * share)))
     draws = np.concatenate(draws)
     value, std = surface.predict(at)
@@ -133,7 +155,10 @@ def test_what_determines_nothing_is_refused(xy, noise, reason):
 
 
 def test_two_measurements_of_each_place_are_as_good_as_their_mean():
-    """All places twice, with noise: the same as one value a place of half the variance."""
+    """All places twice, with noise: the same as one value a place of half the variance.
+
+    Surer, where anything: that they agree also shows how little scatters.
+    """
     rng = np.random.default_rng(8)
     at = np.stack(np.meshgrid(*[np.linspace(0, 0.01, 4)] * 2), axis=-1).reshape(-1, 2)
     truth = draw(rng, at, 0.004, 2.0, 255.0)
@@ -142,8 +167,10 @@ def test_two_measurements_of_each_place_are_as_good_as_their_mean():
     once = krige(at, both.mean(axis=0), np.full(16, 0.3 / np.sqrt(2)))
     assert twice.likeliest.length_m == pytest.approx(once.likeliest.length_m, rel=0.02)
     to = at + 1e-3
-    for found, expected in zip(twice.predict(to), once.predict(to), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=0.02)
+    (found, std), (expected, std_once) = twice.predict(to), once.predict(to)
+    assert np.all(np.abs(found - expected) < 0.6 * std_once)
+    assert np.all(std < 1.02 * std_once)
+    assert np.all(std > 0.7 * std_once)
 
 
 def test_covariance_is_what_a_further_point_takes_away():
@@ -154,7 +181,7 @@ def test_covariance_is_what_a_further_point_takes_away():
     at = rng.uniform(0, 0.02, (5, 2))
     surface = krige(xy, y, np.full(n, 0.1))
     process = surface.likeliest
-    covariance = process.covariance(at, at)
+    covariance = process.covariance(at, at) + process.scatter**2 * np.eye(5)
     _, std = surface.predict(at)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=1e-9)
     # ordinary kriging as its bordered system, with the first place measured too
@@ -165,10 +192,11 @@ def test_covariance_is_what_a_further_point_takes_away():
         return process.std**2 * matern(distance, process.length_m)
 
     system = np.ones((n + 2, n + 2))
-    system[:-1, :-1] = k(both, both) + 0.1**2 * np.eye(n + 1)
+    system[:-1, :-1] = k(both, both) + (0.1**2 + process.scatter**2) * np.eye(n + 1)
     system[-1, -1] = 0
     right = np.vstack([k(both, at), np.ones((1, 5))])
-    left = process.std**2 - np.sum(right * np.linalg.solve(system, right), axis=0)
+    right[n, 0] += process.scatter**2
+    left = process.std**2 + process.scatter**2 - np.sum(right * np.linalg.solve(system, right), axis=0)
     update = std**2 - covariance[:, 0] ** 2 / (covariance[0, 0] + 0.1**2)
     np.testing.assert_allclose(update, left, rtol=1e-6, atol=1e-9)
 
