@@ -108,12 +108,11 @@ def check_in_air(
     weight = 1 / shift_var
     shift, shift_std = float(weight @ shifts / weight.sum()), float(weight.sum() ** -0.5)
     apart = float(np.sum((shifts - shift) ** 2 * weight))
-    damped = float(np.sum(changes**2 / damping_var))
+    damped = changes**2 / damping_var  # (k,)
     unlike = mode.size > 1 and special.chdtrc(mode.size - 1, apart) < SIGNIFICANT
     # materials damp a little more when warm: only what is large counts as damage
-    damaged = special.chdtrc(mode.size, damped) < SIGNIFICANT and bool(
-        np.any(np.abs(changes) > np.maximum(LEAST_DAMPING, 0.1 * at[:, 1]))
-    )
+    large = np.abs(changes) > np.maximum(LEAST_DAMPING, 0.1 * at[:, 1])
+    damaged = bool(np.any(large & (special.chdtrc(1, damped) < SIGNIFICANT / mode.size)))
     moved = special.chdtrc(1, (shift / shift_std) ** 2) < SIGNIFICANT and abs(shift) > LEAST_SHIFT
     figures = "; ".join(
         f"mode {k + 1} at {f:.2f} Hz: {1e2 * s:+.3f} %, damping {c:+.2g}"
@@ -126,7 +125,13 @@ def check_in_air(
         text = f"poles in air too uncertain: frequencies to {1e2 * shift_std:.2g} % ({figures})"
         return Validity(SensorState.UNKNOWN, shift, shift_std, text)
     elif moved:
-        state = SensorState.TEMPERATURE if mode.size > 1 else SensorState.SHIFTED
+        # where the others may as well have stayed, it may be the one that moved most
+        each = weight * shifts**2
+        others = special.chdtrc(max(1, mode.size - 1), each.sum() - each.max())
+        alike = mode.size > 1 and others < SIGNIFICANT
+        state = SensorState.TEMPERATURE if alike else SensorState.SHIFTED
+        if mode.size > 1 and not alike:
+            figures += "; whether the others shifted alike is too uncertain"
     else:
         state = SensorState.AS_CALIBRATED
     return Validity(state, shift, shift_std, f"{state.value} ({figures})")

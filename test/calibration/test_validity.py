@@ -69,6 +69,32 @@ def test_one_mode_does_not_tell_temperature_from_damage(fitted, bench):
     assert not found.usable
 
 
+def test_a_mode_that_may_have_stayed_does_not_tell_temperature_from_damage(fitted):
+    """Mode 2 shifted by .2 %, mode 3 known to .3 %: it is as near to 0 as to .2 %."""
+    expected, _ = poles_in_air(fitted.calibration)
+    own, shifts, stds = expected[1:3], np.array([0.002, 0.0]), np.array([1e-5, 3e-3])
+    damping = np.diag([0.0, 1e-10])
+    covariances = [damping + np.diag([(f * s) ** 2, 0.0]) for (f, _), s in zip(own, stds, strict=True)]
+    for seed in range(20):
+        noise = stds * np.random.default_rng(seed).standard_normal(2)
+        estimates = own * np.stack([1 + shifts + noise, np.ones(2)], axis=1)
+        found = check_in_air(fitted.calibration, list(estimates), covariances)
+        assert found.state is SensorState.SHIFTED
+        assert "whether the others shifted alike is too uncertain" in found.message
+
+
+def test_noise_of_one_damping_is_no_damage_that_another_shows(fitted):
+    """Mode 2 damps 6 % more, surely, as when warm; mode 3 is known to 20 %."""
+    expected, _ = poles_in_air(fitted.calibration)
+    own, stds = expected[1:3], np.array([3e-3, 0.2])
+    covariances = [np.diag([(1e-5 * f) ** 2, (d * s) ** 2]) for (f, d), s in zip(own, stds, strict=True)]
+    for seed in range(20):
+        noise = stds * np.random.default_rng(seed).standard_normal(2)
+        estimates = own * np.stack([np.ones(2), 1 + np.array([0.06, 0.0]) + noise], axis=1)
+        found = check_in_air(fitted.calibration, list(estimates), covariances)
+        assert found.state is SensorState.AS_CALIBRATED
+
+
 def test_dirt_on_the_tip_moves_each_mode_by_itself(fitted, bench):
     tip = replace(bench.sensor.tip, mass_kg=bench.sensor.tip.mass_kg + 5e-6)
     dirty = SimulatedBench(replace(bench.sensor, tip=tip), bench.contact)
