@@ -27,7 +27,7 @@ from tactile_resonance.contact.payload import Mounting, Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import six, vector
 from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
-from tactile_resonance.simulation.noise import Jitter
+from tactile_resonance.simulation.noise import Jitter, Seed
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
@@ -61,7 +61,7 @@ class TipMotion:
     """
 
     def __init__(
-        self, parameters: TrackingParameters, start: Pose, *, period_s: float = 0.002, seed: int = 0
+        self, parameters: TrackingParameters, start: Pose, *, period_s: float = 0.002, seed: Seed = 0
     ) -> None:
         self.period_s = period_s
         self.pose = self.reported = start
@@ -396,7 +396,9 @@ class ContactBench:
             mount=mount,
             carried=tool if on_tool else dish,
         )
-        motion = TipMotion(tracking or TrackingParameters(), start, period_s=period_s, seed=seed)
+        # of its own: of the cell's seed the arm would be shaken by the noise of the cell, one period earlier
+        shaken = [seed, 1]
+        motion = TipMotion(tracking or TrackingParameters(), start, period_s=period_s, seed=shaken)
         self.clock = VirtualBench(self.plant, motion)
         self.arm = VirtualArm(self.clock)
         seat = Mounting(mount, Pose.at_origin(), tool if on_tool else None)

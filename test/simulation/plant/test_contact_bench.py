@@ -6,8 +6,10 @@ import pytest
 
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.noise import Jitter
-from tactile_resonance.simulation.plant.contact_bench import TipMotion
+from tactile_resonance.simulation.plant.contact_bench import ContactBench, TipMotion
+from tactile_resonance.simulation.plant.surfaces import FlatSurface
 from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
+from test.contact.contacts import SOFT
 
 STILL = TrackingParameters(jitter_rms_m=0.0)
 START = Pose(np.array([0.3, 0.1, 0.2]), np.array([0.0, 0.0, 0.0]))
@@ -69,6 +71,24 @@ def test_vibration_is_not_reported_by_the_encoders():
         tip.step()
     np.testing.assert_array_equal(tip.reported.position_m, START.position_m)
     assert 0 < np.abs(tip.pose.position_m - START.position_m).max() < 3e-5
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_noise_of_the_cell_is_not_what_shakes_the_arm(seed):
+    rig = ContactBench(SOFT, FlatSurface.tilted(0.0, 0.0), START, seed=seed)
+    places, forces, count = [], [], 2000
+    for _ in range(count):
+        rig.clock.wait_until(rig.clock.time_ns + 2_000_000)
+        places.append(rig.clock.motion.pose.position_m)
+        forces.extend(sample.wrench[:3] for sample in rig.cell.read())
+    # what drives the vibration is in its acceleration; the cell's noise is white
+    driven = np.diff(places, 2, axis=0)
+    noise = np.array(forces)[: count - 2]
+    driven, noise = (x - x.mean(axis=0) for x in (driven, noise))
+    for lag in range(-4, 5):
+        with_lag = np.roll(noise, lag, axis=0)
+        r = np.sum(driven * with_lag, axis=0) / np.sqrt(np.sum(driven**2, 0) * np.sum(noise**2, 0))
+        assert np.abs(r).max() < 5 * np.sqrt(1.5 / count)
 
 
 def test_bad_parameters_are_named():
