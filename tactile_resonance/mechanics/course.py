@@ -32,6 +32,9 @@ FAST = 1 / 8
 """Time constant of what stands for all faster terms, over the duration of the ramp."""
 INSERTED, STARTS, MOST_STEPS = 10, 3, 60
 """Times at which a further term is tried; so many starts are followed, each so far."""
+WALKS, SHOWN_WALK = 121, 9.0
+"""Sizes of a random walk that are tried; twice the logarithm of the likelihood ratio that shows one: by chance
+one of 700."""
 STEP, STEP_M = 1e-5, 1e-8
 """Of the logarithms and of the place of the surface, for derivatives."""
 
@@ -212,12 +215,11 @@ class SeriesSolution:
     chi_square: float
 
     @property
-    def covariance(self) -> FloatArray:
-        """(unknowns, unknowns) from noise alone."""
+    def inverse(self) -> FloatArray:
+        """(unknowns, residuals) how the unknowns follow the residuals."""
         scale = np.linalg.norm(self.jacobian, axis=0)
         scale[scale == 0] = 1.0
-        inverse = np.linalg.pinv(self.jacobian / scale, rcond=1e-10)
-        return inverse @ inverse.T / np.outer(scale, scale)
+        return np.linalg.pinv(self.jacobian / scale, rcond=1e-10) / scale[:, None]
 
 
 class SeriesProblem:
@@ -377,6 +379,41 @@ class SeriesProblem:
                 priors,
             ]
         )
+
+    def covariance(self, solution: SeriesSolution) -> tuple[FloatArray, float]:
+        """(unknowns, unknowns) from noise, and the random walk that the residuals show [N/sqrt(s)].
+
+        Noise is as large as what the solution leaves, not less than that of the means. What is alike in
+        neighbouring means is taken for a walk, by restricted maximum likelihood (Patterson and Thompson,
+        Biometrika 58, 1971), where a likelihood ratio shows one: then parts of a long hold average it no more.
+        """
+        means, j = self.means, solution.jacobian
+        count, unknowns = j.shape
+        time_s = np.concatenate([means.time_s, means.free_time_s])
+        std_n = np.concatenate([means.std_n, means.free_std_n])
+        since_s = time_s - time_s.min()
+        walk = np.zeros((count, count))  # of one N/sqrt(s), in variances of the means
+        known = slice(0, time_s.size)
+        walk[known, known] = np.minimum.outer(since_s, since_s) / np.outer(std_n, std_n)
+        free = np.linalg.qr(j, mode="complete")[0][:, unknowns:]
+        each, turned = np.linalg.eigh(free.T @ walk @ free)
+        squares = (turned.T @ (free.T @ self.residuals(solution.x))) ** 2
+        dof = max(1, squares.size)
+
+        def cost(square: float) -> tuple[float, float]:
+            of = 1 + square * np.maximum(each, 0.0)
+            level = max(1.0, float((squares / of).sum()) / dof)
+            return float(np.log(level * of).sum() + (squares / of).sum() / level), level
+
+        inverse, (still, _) = solution.inverse, cost(0.0)
+        tried = np.geomspace(1e-6, 1e6, WALKS) / max(float(each.max(initial=0.0)), 1e-300)
+        square = min(tried, key=lambda square: cost(square)[0])
+        least, level = cost(square)
+        if still - least < SHOWN_WALK:
+            level = max(1.0, solution.chi_square / max(1, means.time_s.size - unknowns))
+            return level * inverse @ inverse.T, 0.0
+        noise = level * (np.eye(count) + square * walk)
+        return inverse @ noise @ inverse.T, float(np.sqrt(level * square))
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """(residuals, unknowns), by differences of one batch."""

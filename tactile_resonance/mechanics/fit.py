@@ -93,7 +93,7 @@ class Fit:
         The series with one term more; None where it was not found.
     chi_square, dof : float, int
         Of the means, by the noise of the forces: expected chi_square / dof is 1. Where it is more the
-        covariance is larger by that.
+        covariance is larger by that, or by a walk of the force (`SeriesProblem.covariance`).
     bic : tuple of float
         Of one term, two and so on, for comparison: the number of terms is that of an F test, at 5 %.
     ramp_s, hold_s : float
@@ -233,8 +233,7 @@ def _result(
     means, ball, n = problem.means, problem.ball, best.terms
     count = means.time_s.size
     dof = max(1, count - best.x.size)
-    more = max(1.0, best.chi_square / dof)
-    covariance = more * best.covariance
+    covariance, walk_n_per_sqrt_s = problem.covariance(best)
     std = np.sqrt(np.diag(covariance))
     beyond = None
     if further is not None:
@@ -288,7 +287,9 @@ def _result(
         contact_ratio=ratio,
         sphere_share=sphere,
         layer_share=layer,
-        status=_status(best.chi_square / dof, ratio, sphere, layer, problem),
+        status=_status(
+            best.chi_square / dof, walk_n_per_sqrt_s * math.sqrt(hold_s), ratio, sphere, layer, problem
+        ),
     )
 
 
@@ -317,7 +318,12 @@ def _moved(best: SeriesSolution, further: SeriesSolution) -> FloatArray:
 
 
 def _status(
-    reduced: float, ratio: float, sphere: float, layer: float, problem: SeriesProblem
+    reduced: float,
+    walked_n: float,
+    ratio: float,
+    sphere: float,
+    layer: float,
+    problem: SeriesProblem,
 ) -> tuple[str, ...]:
     said = []
     if not problem.knows_zero:
@@ -329,6 +335,11 @@ def _status(
         )
     if reduced > 2:
         said.append(f"the series leaves {np.sqrt(reduced):.1f} times the noise of the forces")
+    if walked_n > 0:
+        said.append(
+            f"neighbouring means are off alike, as if the zero walked by {1e3 * walked_n:.2g} mN in the hold: "
+            "deviations hold that"
+        )
     if np.isnan(sphere):
         said.append(f"a/R {ratio:.2f}: deeper than the ball's radius, where no model here holds")
     elif not abs(sphere - 1) < HERTZ_OFF:

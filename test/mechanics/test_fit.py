@@ -37,6 +37,29 @@ def test_constants_of_one_and_two_terms_lie_within_their_deviations(stiffness_n_
     assert binom.cdf((pooled < 1.96).sum(), pooled.size, 0.93) > 1e-3
 
 
+def walked(test, walk_n_per_sqrt_s, seed):
+    """The same with a zero of the force that walks at random."""
+    steps = np.sqrt(np.diff(test.time_s, prepend=test.time_s[0]))
+    steps *= walk_n_per_sqrt_s * np.random.default_rng([seed, 1]).standard_normal(steps.size)
+    return replace(test, force_n=test.force_n + np.cumsum(steps))
+
+
+def test_a_zero_that_walks_is_in_the_deviations_and_said():
+    pooled, said = [], 0
+    for seed in range(10):
+        still = relaxation(STANDARD, np.random.default_rng(seed), hold_s=30.0)
+        fit = fit_indentation(walked(still, 1e-4, seed), most_terms=1)
+        said += any("as if the zero walked by" in text for text in fit.status)
+        values = np.log([fit.equilibrium_pa, fit.terms[0].modulus_pa, fit.terms[0].time_s])
+        off = values - np.log([4e3, 3e3, 2.0])
+        pooled.append(off @ np.linalg.solve(fit.covariance, off))
+    # chi square of three each: below four standard errors, and by far not of deviations that hold anything
+    assert said == 10
+    assert 0.3 * 3 < np.mean(pooled) < 3 * (1 + 4 * np.sqrt(2 / 30))
+    steady = fit_indentation(relaxation(STANDARD, np.random.default_rng(0), hold_s=30.0), most_terms=1)
+    assert steady.status == ()
+
+
 def test_terms_beyond_ramp_and_hold_are_not_determined():
     tissue = read_tissues()["liver"]
     rng = np.random.default_rng(3)
