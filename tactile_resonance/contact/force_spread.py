@@ -153,7 +153,8 @@ class ForceOver:
         Standard deviation of that mean [N]: that of the zero, and from the means of eight batches, so that
         correlated noise and a slow decay count as they should (method of batch means; Law, *Simulation
         Modeling and Analysis*, section 9.5.3). Noise that is alike over a batch or longer passes for motion of
-        the force, which is no error of its mean. NaN for fewer than 32 wrenches.
+        the force, which is no error of its mean. NaN for fewer than 32 wrenches, and where all are equal: how
+        far they are off is then up to the step of the converter, which is not known here.
     spread : ForceSpread
         How the force moved meanwhile.
     coverage : float
@@ -278,8 +279,10 @@ class ForceRecord:
             return ForceOver(nan, nan, ForceSpread(), coverage, position_m, rotation_rad, reason)
         inside = (times >= t0_ns) & (times <= t1_ns)
         std_n, spread = math.nan, ForceSpread()
-        if np.count_nonzero(inside & np.isfinite(rows[:, 0])) >= LEAST_WRENCHES:
-            std_n = math.hypot(batches_n, zero_std_n)
+        forces_n = rows[inside & np.isfinite(rows[:, 0]), 0]
+        if forces_n.size >= LEAST_WRENCHES:
+            if np.ptp(forces_n) > 0:
+                std_n = math.hypot(batches_n, zero_std_n)
             time_s = (times[inside] - t0_ns) * 1e-9
             spread = spread_of(time_s, rows[inside, 0], (t1_ns - t0_ns) * 1e-9)
         return ForceOver(float(mean[0]), std_n, spread, coverage, position_m, rotation_rad, "")

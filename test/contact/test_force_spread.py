@@ -246,7 +246,8 @@ def test_nothing_outside_of_the_interval_counts():
     forces = np.where((times >= BEGAN_NS + 400 * MS) & (times <= BEGAN_NS + 500 * MS), 0.01, 5.0)
     over = filled(times, forces).over(BEGAN_NS + 400 * MS, BEGAN_NS + 500 * MS)
     assert over.force_n == pytest.approx(0.01, rel=1e-12)
-    assert over.force_std_n == pytest.approx(0.0, abs=1e-17)
+    # equal forces do not show how far off a converter's step leaves them
+    assert math.isnan(over.force_std_n)
 
 
 @pytest.mark.parametrize(("gap_ms", "covered"), [(3, 1.0), (4, 0.96), (15, 0.85), (37, None)])
@@ -370,11 +371,9 @@ def test_slow_change_counts_as_uncertainty():
 
 def test_few_wrenches_have_no_stated_uncertainty():
     times = BEGAN_NS + MS * np.arange(200)
-    record = filled(times, np.full(200, 0.01))
+    record = filled(times, 0.01 + 1e-6 * (-1.0) ** np.arange(200))
     assert math.isnan(record.over(BEGAN_NS + 50 * MS, BEGAN_NS + 80 * MS).force_std_n)
-    assert record.over(BEGAN_NS + 50 * MS, BEGAN_NS + 81 * MS).force_std_n == pytest.approx(
-        0.0, abs=1e-17
-    )
+    assert record.over(BEGAN_NS + 50 * MS, BEGAN_NS + 81 * MS).force_std_n < 1e-6
     assert record.over(BEGAN_NS + 50 * MS, BEGAN_NS + 80 * MS).force_n == pytest.approx(0.01)
 
 
