@@ -26,6 +26,8 @@ FEWEST_ON_TOP = 4
 """Samples at the largest value; fewer stand there by chance, whether quantised or not."""
 GRID_SAMPLES, FEW_ALIKE = 2000, 0.98
 """Equal samples of a converter from which on its counts are taken to repeat."""
+FEW_LEVELS = 32
+"""With no more values than these a channel may stand still by the steps of its converter alone."""
 LARGE_OFFSET = 0.1
 """Mean against the rms of the rest."""
 LARGE_DRIFT = 0.05
@@ -230,6 +232,9 @@ def missing_samples(x: _Channel) -> Fault | None:
         return None
     total = int(lengths[held].sum())
     text = f"The {x.name} stands still for {total} samples: a gap filled with the last value"
+    levels = np.unique(record).size
+    if 1 < levels <= FEW_LEVELS:
+        text += f", or a converter whose steps are too coarse for it ({levels} values in all)"
     return x.fault(FaultKind.MISSING_SAMPLES, total, True, text)
 
 

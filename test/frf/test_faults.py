@@ -91,6 +91,16 @@ def test_missing_samples(record):
     assert kinds(check(u, np.zeros_like(y))) == {FaultKind.MISSING_SAMPLES}
 
 
+def test_a_coarse_converter_may_be_why_a_channel_stands_still(record):
+    u, y = record
+    step = 1.6 * y.std()
+    fault = only(check(u, step * np.round(y / step)), FaultKind.MISSING_SAMPLES, "sensor")
+    assert "a converter whose steps are too coarse" in fault.text
+    held = y.copy()
+    held[2, 100:130] = held[2, 99]
+    assert "converter" not in only(check(u, held), FaultKind.MISSING_SAMPLES, "sensor").text
+
+
 def test_lost_samples(record):
     u, y = record
     lost = np.append(np.delete(u.ravel(), np.arange(3300, 3307)), u.ravel()[:7])
