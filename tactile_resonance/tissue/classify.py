@@ -64,7 +64,8 @@ class TissueCall:
     name : str
         Most probable class; `UNKNOWN` where the pole lies outside of all classes, or is not known.
     probability : float
-        Of that class, given that it is one of the classes; NaN for `UNKNOWN`.
+        Of that class, given that it is one of the classes; NaN for `UNKNOWN`. Too sure where classes of few
+        samples lie close together: docs/references.md.
     reason : str
         Why it is `UNKNOWN`.
     """
@@ -200,7 +201,7 @@ def _density_and_tail(
     """(...) log density, and probability of lying as far out, of (..., 2) with noise (..., 2, 2).
 
     With an estimated spread the sum of Student's and Gaussian deviations is taken as Student's of the
-    summed scale: exact where either vanishes.
+    summed scale: exact where the noise vanishes, else too wide: fewer lie as far out than is returned.
     """
     scale = tissue.spread + noise
     unit = np.sqrt(np.diagonal(scale, axis1=-2, axis2=-1))
