@@ -19,6 +19,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.calibration.model import Calibration
 from tactile_resonance.calibration.validity import Validity, check_in_air
 from tactile_resonance.contact.goal import State
+from tactile_resonance.fields import counted
 from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.record import Origin
 from tactile_resonance.recording.messages import poles_from_message
@@ -284,8 +285,27 @@ def calibration_in_air(run: RunContent, calibration: Calibration) -> Validity:
 
 
 def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, str]:
-    """Whether the sensor has drifted between the references of a run."""
-    return judge_drift(read_reference(run, BEFORE), read_reference(run, AFTER), limits)
+    """Whether the sensor has drifted between the references of a run.
+
+    One that failed, or was damaged, is taken when the run is resumed: of points that were measured before the
+    first, or after the last, it says nothing.
+    """
+    health, sentence = judge_drift(read_reference(run, BEFORE), read_reference(run, AFTER), limits)
+    if health is not SensorHealth.STEADY:
+        return health, sentence
+    first_ns, last_ns = (
+        next(of.end_ns for of in run.files if of.name.endswith(f"-{name}.mcap"))
+        for name in (BEFORE, AFTER)
+    )
+    done = [of.time_ns for of in run.latest if of.outcome is PointOutcome.DONE]
+    if outside := sum(not first_ns <= time_ns <= last_ns for time_ns in done):
+        which = counted(outside, "point was", "points were")
+        figures = sentence.partition(": ")[2]
+        return (
+            SensorHealth.UNKNOWN,
+            f"sensor health unknown, {which} not measured between the references in air: {figures}",
+        )
+    return health, sentence
 
 
 FIELD_OF = {

@@ -5,6 +5,7 @@ import csv
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from tactile_resonance.contact.goal import State
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.run_report import as_page, summary
+from tactile_resonance.scan import point_outcome
 from tactile_resonance.scan.point_outcome import (
     BETWEEN,
     SensorHealth,
@@ -19,6 +21,7 @@ from tactile_resonance.scan.point_outcome import (
     budget_sentence,
     judge_drift,
     relative_to_air,
+    sensor_health,
     time_budget,
 )
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
@@ -85,6 +88,22 @@ def test_drift_is_a_change_beyond_uncertainty_and_limit(after, health):
     assert judged is health
     assert "f0 in air 246.600 Hz before" in sentence
     assert ("warning" in sentence) == (health is SensorHealth.DRIFTED)
+
+
+@pytest.mark.parametrize(("times_s", "outside"), [((5, 6), 0), ((1, 6), 1), ((5, 9), 1), ((1, 9), 2)])
+def test_references_vouch_for_the_points_between_them(monkeypatch, times_s, outside):
+    """One that failed, or was damaged, is taken as the run is resumed."""
+    monkeypatch.setattr(point_outcome, "read_reference", lambda run, name: reference())
+    names = {"reference-00-air-before.mcap": 3, "reference-01-air-after.mcap": 8}
+    run = SimpleNamespace(
+        files=[SimpleNamespace(name=name, end_ns=seconds * 10**9) for name, seconds in names.items()],
+        latest=[PointResult(k, time_ns=seconds * 10**9) for k, seconds in enumerate(times_s)]
+        + [PointResult(2, outcome=PointOutcome.SKIPPED, time_ns=1)],
+    )
+    health, sentence = sensor_health(run, LIMITS)
+    assert health is (SensorHealth.UNKNOWN if outside else SensorHealth.STEADY)
+    assert "f0 in air 246.600 Hz before" in sentence
+    assert outside == 0 or f"{outside} point" in sentence
 
 
 def test_without_a_reference_nothing_is_known():
