@@ -120,7 +120,9 @@ def recorded_results(run: RunContent) -> Iterator[bytes]:
     In runs of earlier versions references have none, and poles are the last ones in the file of the point.
     """
     entries, _ = read_index(run.path)
-    for path in run.paths():
+    # as they were finished, whatever the clock showed: of two attempts at a point the later message counts
+    order = {Path(name).name: number for number, name in enumerate(entries)}
+    for path in sorted(run.paths(), key=lambda path: order.get(path.name, -1)):
         entry = entries.get(f"{RECORDING}/{path.name}")
         if entry is not None and entry.result is not None:
             yield entry.message

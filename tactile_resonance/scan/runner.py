@@ -96,6 +96,7 @@ class ScanRunner:
         self._air: MainMode | None = None
         self._left_s = NAN  # when the tip was free after the newest point
         self._again: ScanPoint | None = None  # attempted last, and nothing was kept of it
+        self._last: ScanPoint | None = None  # finished last
 
     def run(self) -> Summary:
         """Finish every point that is not; references, of free air and silent, are taken before and after."""
@@ -148,12 +149,14 @@ class ScanRunner:
         request = self._controls.take()
         repeats = request is Request.REPEAT and again is None
         if repeats and (content := self._run.content).results:
+            # by the clock, which may have been set, only of what was finished before
             latest = max(content.results, key=lambda result: result.time_ns)
-            return content.points[latest.index]
+            return self._last or content.points[latest.index]
         if request is Request.SKIP and point is not None:
             with self._run.begin_point(point.index) as recording:
                 result = self._ended(point, recording, PointOutcome.SKIPPED, SKIPPED, 0.0)
                 self._publish(recording.finish(result))
+                self._last = point
             return self._next()
         return point
 
@@ -264,6 +267,7 @@ class ScanRunner:
             )
             self._left_s = begun_s + duration_s
             self._publish(recording.finish(result))
+            self._last = point
         self._durations_s += duration_s
         self._timed += 1
         if result.outcome is PointOutcome.FAILED and scene.on_failure is OnFailure.STOP:

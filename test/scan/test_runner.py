@@ -21,10 +21,12 @@ from tactile_resonance.report.run_report import summary as sentences
 from tactile_resonance.report.run_tables import point_table
 from tactile_resonance.scan.decision import Separate
 from tactile_resonance.scan.hands import Controls, Request
+from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_outcome import SensorHealth
-from tactile_resonance.scan.point_result import TYPE, PointOutcome
+from tactile_resonance.scan.point_result import TYPE, PointKind, PointOutcome, from_message
+from tactile_resonance.scan.recorded import recorded_results
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.runner import ScanRunner
@@ -267,6 +269,39 @@ def test_repeat_between_points_makes_a_second_attempt(tmp_path):
     assert again.seeds == [(1, 1, 1)]  # it has noise of its own
     content = read_run(tmp_path / "run")
     assert [(r.index, r.attempt) for r in content.results] == [(0, 0), (1, 0), (1, 1)]
+
+
+def test_a_clock_that_is_set_back_changes_neither_the_last_point_nor_the_latest_attempt(
+    tmp_path, monkeypatch
+):
+    controls, set_s, time_ns = Controls(), [0.0], time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: time_ns() + round(1e9 * set_s[0]))
+
+    class Repeated(Bench):
+        def missing(self):
+            touched = [entry[1] for entry in self.log if entry[0] == "touch"]
+            if touched == [0, 1]:
+                set_s[0] = -3600.0
+            if touched == [0, 1, 2]:
+                controls.ask(Request.REPEAT)
+            return None
+
+    bench = Repeated()
+    scan(tmp_path / "set", scene(4), bench, controls)
+    assert [entry[1] for entry in bench.log if entry[0] == "touch"] == [0, 1, 2, 2, 3]
+    set_s[0] = 0.0
+    scan(tmp_path / "run", scene(2), Bench())
+    set_s[0] = -3600.0
+    with RunDirectory.open(tmp_path / "run") as again:
+        controls.ask(Request.REPEAT)
+        ScanRunner(make_plan(scene(2)), again, Bench(), controls, lambda progress: None).run()
+    types = message_types()
+    told = [
+        from_message(types.deserialize_cdr(cdr, TYPE))
+        for cdr in recorded_results(read_run(tmp_path / "run"))
+    ]
+    attempts = [(each.index, each.attempt) for each in told if each.kind is PointKind.TISSUE]
+    assert attempts == [(0, 0), (1, 0), (1, 1)]
 
 
 def test_a_paused_scan_waits_with_the_tip_free(tmp_path):
