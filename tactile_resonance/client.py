@@ -24,7 +24,14 @@ from unique_identifier_msgs.msg import UUID
 
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.msg import PointResult
-from tactile_resonance.nodes.goals import ASK_AGAIN_S, GoalClient, Steps, answer_to, offer
+from tactile_resonance.nodes.goals import (
+    ASK_AGAIN_S,
+    GoalClient,
+    Steps,
+    answer_to,
+    failed_in,
+    offer,
+)
 from tactile_resonance.nodes.running import NEW_POINT_RESULTS, STEADY
 
 TICK_S = 0.1
@@ -126,19 +133,21 @@ class AskedGoal:
     heard_s: float = -math.inf
     heard: Any = None  # the newest feedback
 
-    def lost(self) -> Any:
-        """Outcome where the server went away."""
+    def lost(self, why: str = "scan_node went away") -> Any:
+        """Outcome where the server went away, or does not know."""
         run = getattr(self.heard, "run_directory", "")
         if not run:
-            return self.kind(Ending.LOST, "scan_node went away")
+            return self.kind(Ending.LOST, why)
         far = f"{self.heard.finished} of {self.heard.points} points were finished"
-        text = f"scan_node went away, {far}; the run can be resumed"
+        text = f"{why}, {far}; the run can be resumed"
         unknown = dict.fromkeys(("done", "failed", "skipped"))
         return self.kind(Ending.LOST, text, run_directory=run, **unknown)
 
     def outcome(self, answer: Any) -> Any:
         """Outcome of the answer to the goal's result."""
         result, ending = answer.result, _ENDINGS[answer.result.outcome]
+        if failed_in(answer):
+            return self.lost("scan_node failed in it, its log says how")
         if answer.status == GoalStatus.STATUS_CANCELED:
             ending = Ending.CANCELLED
         names = [f.name for f in fields(self.kind) if f.name != "ending"]

@@ -199,6 +199,9 @@ class ExcitationNode(ManagedNode):
             result.message = f"{NO_RECORDS if isinstance(error, OSError) else ''}{error}"
             failed = result.outcome == Measure.Result.FAILED
             self.health.error(f"{'failed' if failed else 'refused'}: {result.message}")
+        except Exception as error:  # an answer without this would tell of a measurement that is done
+            result.outcome = Measure.Result.FAILED
+            result.message = self.health.failed("measurement", error)
         return result
 
     def _plan(self, goal: Measure.Goal) -> list[Excitation]:

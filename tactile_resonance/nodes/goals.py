@@ -27,7 +27,14 @@ from rclpy.client import Client
 from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
-from tactile_resonance.scan.hands import Check, Interrupted, NodeAway, PointFailed, ScanEnded
+from tactile_resonance.scan.hands import (
+    Check,
+    Interrupted,
+    NodeAway,
+    PointDisturbed,
+    PointFailed,
+    ScanEnded,
+)
 
 
 class GoalClient(ActionClient):
@@ -133,7 +140,10 @@ class Goals:
         raise ScanEnded(f"{self.name}: no node takes the goal for {TAKEN_WITHIN_S:g} s")
 
     def follow(self, handle: ClientGoalHandle, check: Check) -> Any:
-        """Result of a goal; where anything is raised the goal is cancelled first, and its end waited for."""
+        """Result of a goal; where anything is raised the goal is cancelled first, and its end waited for.
+
+        `PointDisturbed` where a defect of the node ended it.
+        """
         steps = answer_to(self.client, handle, lambda: self._heard_s)
         try:
             answer = self._wait(steps, lambda: self._require_node(check))
@@ -146,6 +156,9 @@ class Goals:
             if answer is not None and answer.goals_canceling:
                 self._wait(steps, lambda: None, time.monotonic() + GOAL_ENDS_WITHIN_S)
             raise
+        if failed_in(answer):
+            text = f"{self.name}: its node failed in it, its log says how"
+            raise PointDisturbed(text, "node failed")
         return answer.result
 
     def _wait(self, steps: Steps, each: Callable[[], None], until_s: float = math.inf) -> Any:
@@ -261,6 +274,12 @@ def answer_to(
         elif now_s - seen_s > GONE_S:
             return None
         yield
+
+
+def failed_in(answer: Any) -> bool:
+    """Whether a defect ended a goal: rclpy gives an empty result then, whose outcome is that of success."""
+    aborted = answer.status == GoalStatus.STATUS_ABORTED
+    return aborted and answer.result == type(answer.result)()
 
 
 def _known(refused: ClientGoalHandle) -> Generator[None, None, bool]:

@@ -196,6 +196,8 @@ class ScanNode(ManagedNode):
             result.message = str(error) or "cancelled"
         except ValueError as error:
             result.outcome, result.message = result.REFUSED, str(error)
+        except Exception as error:  # an answer without this would tell of a table that was found
+            result.message = self.health.failed("calibration", error)
         else:
             fill_calibration_result(result, made)
             if file is not None:
@@ -230,6 +232,8 @@ class ScanNode(ManagedNode):
         except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
             result.message = str(error) or "cancelled before the first point"
             self.health.error(result.message)
+        except Exception as error:  # an answer without this would tell of a complete scan
+            result.message = self.health.failed("scan", error)
         finally:
             self._progress, self._told, self._run_directory = None, None, ""
         return result

@@ -377,6 +377,31 @@ def test_a_run_that_began_with_a_robot_is_not_resumed_without(stack):
     assert outcome.message == f"contact: got 'none'; {accepted}"
 
 
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+@pytest.mark.parametrize("where", ["start_run", "_scan"])
+def test_a_scan_that_a_defect_ends_is_not_complete(stack, monkeypatch, where):
+    """ROS answers with an empty result then, whose outcome is that of a complete scan."""
+
+    def defect(*_, **__):
+        raise KeyError("what nobody thought of")
+
+    monkeypatch.setattr(scan_node if where == "start_run" else ScanNode, where, defect)
+    stack.activate()
+    outcome = stack.ended(stack.client.scan(**{**GOAL, "run_directory": stack.folder / "run"}))
+    expected = {
+        "start_run": (Ending.REFUSED, "KeyError: 'what nobody thought of'"),
+        "_scan": (Ending.LOST, "scan_node failed in it, its log says how"),
+    }
+    assert (outcome.ending, outcome.message) == expected[where]
+    if where == "_scan":
+        return
+    monkeypatch.undo()
+    heard = []
+    again = stack.begin(heard, run_directory=stack.folder / "second")  # the next is taken
+    stack.client.cancel()
+    assert stack.ended(again).ending is Ending.CANCELLED
+
+
 def test_a_scan_node_in_a_namespace_is_named(stack):
     client = TactileClient(stack.user, namespace="left")
     outcome = stack.ended(client.scan(**GOAL, wait_s=0.3))

@@ -327,3 +327,12 @@ def test_where_nobody_measures_the_force_the_place_is_what_is_told():
         assert contact.reason == "the force is not measured (contact_source)"
     assert told.position_m == (0.1, 0.0, 0.3)
     assert told.time_ns == START_NS
+
+
+def test_a_measurement_that_a_defect_ends_is_not_done():
+    told = []
+    health = SimpleNamespace(failed=lambda what, error: told.append(what) or repr(error))
+    node = SimpleNamespace(_plan=lambda goal: {}["what nobody thought of"], health=health)
+    result = ExcitationNode._measure(node, SimpleNamespace(request=Measure.Goal()))
+    assert (result.outcome, result.blocks) == (Measure.Result.FAILED, 0)
+    assert (result.message, told) == ("KeyError('what nobody thought of')", ["measurement"])

@@ -13,13 +13,19 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from action_msgs.msg import GoalStatus
 from rclpy.action.client import ClientGoalHandle
 from rclpy.task import Future
-from tactile_resonance.action import Scan
+from tactile_resonance.action import Measure, Scan
 
 from tactile_resonance import client as client_module
 from tactile_resonance.client import Ending, TactileClient
 from tactile_resonance.nodes import goals as goals_module
 from tactile_resonance.nodes.goals import ASK_AGAIN_S, GOAL_ENDS_WITHIN_S, TAKEN_WITHIN_S, Goals
-from tactile_resonance.scan.hands import Interrupted, NodeAway, PointFailed, ScanEnded
+from tactile_resonance.scan.hands import (
+    Interrupted,
+    NodeAway,
+    PointDisturbed,
+    PointFailed,
+    ScanEnded,
+)
 
 REFUSED = "refused"
 LOST = None
@@ -190,6 +196,17 @@ def test_a_result_that_is_lost_is_requested_again(taken):
     node.end(node.asked[0])
     assert goals.follow(handle, nothing) == GoalStatus.STATUS_SUCCEEDED
     assert node.now_s == pytest.approx(2 * goals_module.SILENT_S, abs=0.1)
+
+
+def test_a_goal_that_a_defect_ended_is_not_taken_for_done(taken):
+    """ROS answers with an empty result, in which a measurement is done."""
+    node, goals = taken()
+    handle = goals.send("goal", nothing)
+    assert Measure.Result().outcome == Measure.Result.DONE
+    node.result_of = lambda status: Measure.Result()
+    node.end(bytes(handle.goal_id.uuid), GoalStatus.STATUS_ABORTED)
+    with pytest.raises(PointDisturbed, match="its node failed in it"):
+        goals.follow(handle, nothing)
 
 
 def test_a_result_is_requested_once_while_feedback_comes(taken):
