@@ -104,6 +104,8 @@ class OneGoal:
             except (ValueError, OSError) as error:
                 reason = " ".join(str(error).split())
                 self._node.get_logger().warning(f"goal rejected: {reason}")
+            except Exception as error:  # else it ends the node
+                reason = self._node.health.failed("goal", error)
             if self._asked == asked:  # no other came while this one was checked
                 self._rejection = reason
             return bool(reason)

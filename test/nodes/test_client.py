@@ -402,6 +402,18 @@ def test_a_scan_that_a_defect_ends_is_not_complete(stack, monkeypatch, where):
     assert stack.ended(again).ending is Ending.CANCELLED
 
 
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_a_goal_that_a_defect_rejects_has_that_as_its_reason(stack, monkeypatch):
+    def defect(*_, **__):
+        raise KeyError("what nobody thought of")
+
+    stack.activate()
+    assert stack.ended(stack.client.scan(**{**GOAL, "frame": "camera"})).ending is Ending.REJECTED
+    monkeypatch.setattr(scan_node, "new_run", defect)
+    outcome = stack.ended(stack.client.scan(**GOAL))
+    assert outcome == ScanOutcome(Ending.REJECTED, "KeyError: 'what nobody thought of'")
+
+
 def test_a_scan_node_in_a_namespace_is_named(stack):
     client = TactileClient(stack.user, namespace="left")
     outcome = stack.ended(client.scan(**GOAL, wait_s=0.3))
