@@ -174,7 +174,8 @@ class TipContact:
             ):
                 self.touching, self.touched_ns = False, None
                 moved_n = self._state.zero_moved_n
-                return 0.0 if math.isnan(moved_n) else moved_n
+                # of a goal that was refused no contact was seen: what is told is of the one before
+                return 0.0 if math.isnan(moved_n) or not self._times.fields else moved_n
             state = self._state
             if state.cause == Cause.HELD.value and state.state == state.STATE_FAULT:
                 raise ScanEnded(f"the tip is held: {state.message}")

@@ -63,9 +63,12 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     assert tip.spent_s["hold_s"] == pytest.approx(0.08)
 
 
-def drawn_back(monkeypatch, **state):
-    """What `retract` comes to where contact_node then reports this state."""
+def drawn_back(monkeypatch, seen=("approach", "hold", "retract"), **state):
+    """What `retract` comes to where contact_node then reports this state, after those seen."""
     tip = TipContact.__new__(TipContact)
+    tip._times = StateTimes()
+    for k, each in enumerate(seen):
+        tip._times.take(each, 10**9 * (k + 1))
     tip.touching, tip.touched_ns, tip._end_if_hung = True, 1, lambda: None
     tip._time = SimpleNamespace(go=lambda: None)
 
@@ -99,3 +102,7 @@ def test_a_reference_in_air_is_disturbed_where_another_client_moves_the_tip(stat
     with pytest.raises(PointDisturbed, match=f"contact: {state}: asked for by another client") as caught:
         tip.check()
     assert caught.value.kind == "busy"
+
+
+def test_the_zero_of_the_contact_before_is_not_that_of_a_goal_that_was_refused(monkeypatch):
+    assert drawn_back(monkeypatch, ("idle",), state="idle", zero_moved_n=-2e-3) == 0.0
