@@ -370,11 +370,12 @@ class _Fit:
         at = np.array([complex(value[0], value[1])])
         f0_hz, damping = natural_frequency_and_damping(at)
         turn = natural_frequency_and_damping_jacobian(at)[0]
+        channels = sensor.gain * np.exp(-at * sensor.delay_s)  # of G; residues of the model are without
         found = Poles(
             poles_rad_s=at,
             f0_hz=f0_hz,
             damping_ratio=damping,
-            residues=sensor.residues(at, self.prior.stiffness(p)),
+            residues=channels * sensor.residues(at, self.prior.stiffness(p)),
             covariance=(turn @ noise[:2, :2] @ turn.T)[None],
             total_covariance=(turn @ with_sensor[:2, :2] @ turn.T)[None],
             pole_covariance=noise[None, :2, :2],

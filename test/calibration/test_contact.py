@@ -76,6 +76,19 @@ def test_without_noise_the_transient_is_exact(known, bench, library):
     assert found.poles.cost < 1.5  # of the priors: nothing is left of the record
 
 
+def test_the_residue_is_that_of_the_response_as_it_was_measured(bench, given, library):
+    """Gain and delay of the channels included."""
+    model = replace(given.model, gain=1.25)
+    record = played(bench, contact_of(bench, library["gel10"]), seed=2, skew_s=SKEW_S)
+    estimator = CalibratedEstimator(replace(given, model=model), bench.sensor.tip.radius_m)
+    found = estimator(replace(record, y=1.25 * record.y), FORCE_N)
+    assert found.status is ContactStatus.OK
+    circle = np.exp(2j * np.pi * np.arange(32) / 32)
+    about = found.poles.poles_rad_s[0] + circle
+    response = model.response(about, found.prior.stiffness(found.parameters).at(about))
+    np.testing.assert_allclose(found.poles.residues[0], np.mean(response * circle), rtol=1e-9)
+
+
 def test_a_settled_record_needs_no_known_start(known, bench, library):
     off = []
     for index, name in enumerate(LIBRARY):
