@@ -259,7 +259,8 @@ def _differences_table(found: Sequence[Difference]) -> str:
 def _figure(title: str, found: Sequence[Difference]) -> dict[str, Any]:
     """Places in the colours of the change of f0 in standard deviations."""
     if not found:
-        return {"title": title, "note": "Left out: no place in common.", "traces": [], "layout": {}}
+        note = "Left out: no place in common where both have poles with a covariance."
+        return {"title": title, "note": note, "traces": [], "layout": {}}
     where = MM * np.array([each.first.position_m[:2] for each in found])
     off = [each.deviations[0] for each in found]
     texts = [

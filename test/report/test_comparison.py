@@ -12,6 +12,7 @@ import pytest
 from scipy import stats
 
 from tactile_resonance.cli import main
+from tactile_resonance.report import comparison
 from tactile_resonance.report.comparison import differences, sentence, unlike
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.run_content import RunContent, read_run
@@ -75,6 +76,8 @@ def test_only_equal_places_with_poles_are_compared():
     found = differences(first, run_of(changed))
     assert [(each.first.index, each.other.index) for each in found] == [(0, 0)]
     assert "no place in common" in sentence("b", "a", [])
+    # there may be places where one has no pole, or none with a covariance
+    assert comparison._figure("b less a", [])["note"].endswith("where both have poles with a covariance.")
     assert differences(first, run_of([])) == []
 
 
