@@ -277,10 +277,14 @@ def evenly(count: int, most: int) -> IntArray:
 def _model_entry(
     frequency_hz: FloatArray, g: ComplexArray, std: FloatArray, poles: Poles
 ) -> dict[str, Any] | None:
-    """Response of the model in a band; None where there are no poles or too few lines for the rest of it."""
+    """Response of the model in a band; None where there are no poles, or nothing to take the rest of it from.
+
+    That are too few lines, and an FRF without a variance: it is of one period, with its transient.
+    """
     inside = (frequency_hz >= poles.band_hz[0]) & (frequency_hz <= poles.band_hz[1])
     terms = poles.structure.numerator_order - poles.structure.order + 1
-    if not poles.f0_hz.size or 2 * np.count_nonzero(inside) < terms:
+    unknown = not np.any(np.isfinite(std[inside]))
+    if not poles.f0_hz.size or unknown or 2 * np.count_nonzero(inside) < terms:
         return None
     low, high = poles.band_hz
     half = _ACROSS_HALF_WIDTHS * poles.damping_ratio * poles.f0_hz

@@ -163,6 +163,17 @@ def test_the_model_with_the_poles_and_residues_of_a_fit_is_the_fit(hostile):
     np.testing.assert_allclose(found, poles.fit.response(at_hz), rtol=1e-6)
 
 
+def test_of_a_single_period_no_model_is_drawn(hostile):
+    """Its FRF holds the transient, after which the polynomial beside the modes would bend."""
+    frf, poles = hostile[1][0]
+    message = SimpleNamespace(frequency_hz=frf.frequency_hz, real=frf.g.real, imag=frf.g.imag)
+    message.variance_total, message.total_dof = frf.variance_noise, 7
+    assert len(frf_entry(message, poles, 600)["models"]) == 1
+    message.variance_total = message.variance_noise = np.empty(0)
+    message.noise_dof = 0
+    assert frf_entry(message, poles, 600)["models"] == []
+
+
 def test_covariances_go_over_into_the_s_plane():
     rng = np.random.default_rng(3)
     at, std = np.array([250.0, 0.034]), np.array([0.02, 1e-4])

@@ -215,8 +215,9 @@
   const DB = 20 / Math.LN10;
 
   function drawFrf(place, entries) {
-    const title = "frequency response, 95 % bars, and the model";
     const there = entries.filter(({ detail }) => detail && detail.frf);
+    const known = !there.length || there.some(({ detail }) => detail.frf.std.some((std) => std !== null));
+    const title = known ? "frequency response, 95 % bars, and the model" : "frequency response of one period, with its transient; errors unknown";
     if (!there.length) return nothing(place, title, "no FRF of this point in the page");
     const traces = [];
     let range = null;
