@@ -143,11 +143,13 @@ def draw_calibration(fitted: Fitted, title: str) -> Figure:
         above.semilogx(frf.frequency_hz, decibel(np.abs(model) ** 2), "k-", lw=0.6, label="model")
         _dots(above, frf.frequency_hz, np.abs(residual * std) ** 2, "|G - model|", 1, color="C3")
         above.semilogx(frf.frequency_hz, decibel(std**2), "C1-", lw=0.8, label="std of G")
-        below.semilogx(frf.frequency_hz, residual.real, ".", ms=1, label="real")
-        below.semilogx(frf.frequency_hz, residual.imag, ".", ms=1, label="imaginary")
+        for label, part in (("real", residual.real), ("imaginary", residual.imag)):
+            own = np.sqrt(2) * part  # half of the variance is of either
+            below.semilogx(frf.frequency_hz, own, ".", ms=1, label=label)
         mean = np.mean(np.abs(residual) ** 2)
         below.set_title(f"mean square {mean:.2f} of noise", fontsize="small")
-        below.set(xlabel="frequency [Hz]", ylim=(-6, 6))
+        low, high = below.get_ylim()
+        below.set(xlabel="frequency [Hz]", ylim=(min(low, -6), max(high, 6)))
     axes[0, 0].set_ylabel("[dB]")
     axes[1, 0].set_ylabel("residual [standard deviations]")
     for row in axes:

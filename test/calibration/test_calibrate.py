@@ -8,6 +8,7 @@ import pytest
 
 from tactile_resonance.calibration.fit import calibrate
 from tactile_resonance.calibration.records import Load
+from tactile_resonance.report.drawing import draw_calibration
 
 
 def of_loads(records, *loads):
@@ -31,6 +32,21 @@ def test_residuals_are_noise(fitted):
         assert 0.8 < np.mean(np.abs(residual) ** 2) < 2.0
     # 0.5 mV rms in 25 kHz
     assert fitted.calibration.noise_v_per_root_hz == pytest.approx(5e-4 / np.sqrt(25e3), rel=0.05)
+
+
+def test_residuals_are_drawn_in_their_own_standard_deviations_and_none_is_cut_off(fitted):
+    rng = np.random.default_rng(1)
+    noise = [rng.normal(size=(2, r.frf.g.size)) * np.sqrt(0.5) for r in fitted.records]  # E|.|^2 is 1
+    residuals = tuple(real + 1j * imaginary for real, imaginary in noise)
+    residuals[0][3] = 20.0
+    figure = draw_calibration(replace(fitted, residuals=residuals), "drawn")
+    below = figure.axes[len(residuals) :]
+    for axes in below:
+        for line in axes.lines[:2]:
+            assert np.mean(np.abs(line.get_ydata()) < 1.96) == pytest.approx(0.95, abs=0.02)
+            low, high = axes.get_ylim()
+            assert low <= np.min(line.get_ydata()) <= np.max(line.get_ydata()) <= high
+    assert all(axes.get_ylim() == (-6, 6) for axes in below[1:])
 
 
 def test_without_a_load_the_tip_is_declared_unknown(records, truth):
