@@ -86,6 +86,11 @@ class MapPoint:
             raise ValueError(
                 f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
             )
+        if not np.all(np.isfinite([*contact.position_m, *contact.orientation_xyzw])):
+            raise ValueError(
+                f"tip_pose of measurement {origin.measurement_id}: got {contact.position_m}, "
+                f"{contact.orientation_xyzw}; accepted are finite numbers"
+            )
         normal = Rotation.from_quat(contact.orientation_xyzw).as_matrix()[:, 2]
         return cls(result, np.array(contact.position_m), normal)
 

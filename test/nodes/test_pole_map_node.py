@@ -425,9 +425,10 @@ def test_poles_of_nowhere_or_another_frame_are_left_out(bench):
     lost.tip_pose.header.frame_id = ""
     bench.publisher.publish(poles(3, 0.004, 252.0, frame="elsewhere"))
     bench.publisher.publish(lost)
-    bench.until(lambda: bench.map_node._left_out == 2)
+    bench.publisher.publish(poles(4, 0.004, 253.0, place=(np.nan, 0.001, 0.0)))
+    bench.until(lambda: bench.map_node._left_out == 3)
     assert len(table(bench.read(PointCloud2, "pole_map")[0])) == 1
-    assert bench.map_node.details()["left out"] == "2"
+    assert bench.map_node.details()["left out"] == "3"
 
 
 def test_clear_empties_every_output(bench):
