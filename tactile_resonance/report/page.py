@@ -141,6 +141,8 @@ def point_entry(result: PointResult) -> dict[str, Any]:
         "reason": "; ".join(t for t in (result.reason, result.tissue_reason, result.notes) if t),
         "x_mm": known(MM * result.x_m),
         "y_mm": known(MM * result.y_m),
+        "z_mm": known(MM * result.z_m),
+        "frame": result.frame_id,
         "force_mn": known(MN * result.force_n),
         "force_std_mn": known(MN * result.force_std_n),
         "force_rms_mn": known(MN * result.force_rms_n),

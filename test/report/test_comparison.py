@@ -13,7 +13,7 @@ from scipy import stats
 
 from tactile_resonance.cli import main
 from tactile_resonance.report import comparison
-from tactile_resonance.report.comparison import differences, sentence, unlike
+from tactile_resonance.report.comparison import as_comparison, differences, sentence, unlike
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.run_content import RunContent, read_run
 
@@ -175,6 +175,21 @@ def test_the_page_shows_both_runs_at_one_place(page):
     with browser() as shown:
         address = f"{page[0].as_uri()}#run=2&point=3"
         shown.show(address, f"document.querySelector('h2')?.textContent === '{wanted}'")
+        assert shown.console == []
+
+
+def test_a_click_shows_no_point_of_another_frame_or_height_as_one_of_its_place(page, tmp_path):
+    first, other = map(read_run, page[1])
+    moved = [replace(r, frame_id="base") if r.index == 1 else r for r in other.results]
+    moved = [replace(r, z_m=r.z_m + 1e-3) if r.index == 2 else r for r in moved]
+    path = tmp_path / "moved.html"
+    path.write_text(as_comparison([first, replace(other, results=tuple(moved))]), encoding="utf-8")
+    both = "run (1), point 1 and run (2), point 1"
+    with browser() as shown:
+        for point, wanted in ((1, both), (2, "run (1), point 2"), (3, "run (1), point 3")):
+            shown.show("about:blank", "true")
+            address = f"{path.as_uri()}#run=1&point={point}"
+            shown.show(address, f"document.querySelector('h2')?.textContent === '{wanted}'")
         assert shown.console == []
 
 

@@ -156,9 +156,11 @@
     if (!selected) return [];
     const point = selected.run.bands[0].points.find((p) => p.index === selected.index);
     if (!point) return [];
-    const near = (other) => other.x_mm !== null && Math.hypot(other.x_mm - point.x_mm, other.y_mm - point.y_mm) <= SAME_PLACE_MM;
+    const off = (other) => (other.x_mm === null || other.frame !== point.frame ? Infinity :
+      Math.hypot(other.x_mm - point.x_mm, other.y_mm - point.y_mm, other.z_mm - point.z_mm));
+    const nearest = (points) => points.filter((each) => off(each) <= SAME_PLACE_MM).sort((a, b) => off(a) - off(b))[0];
     return page.runs.flatMap((run) => {
-      const there = run === selected.run ? point : run.bands[0].points.find(near);
+      const there = run === selected.run ? point : nearest(run.bands[0].points);
       return there ? [{ run, point: there, detail: run.details[there.index] }] : [];
     });
   }
