@@ -352,10 +352,10 @@ def test_outputs_never_replace_what_they_must_not(good, tmp_path, capsys):
     fifo = tmp_path / "device"
     os.mkfifo(fifo)
     for options, message in (
-        (["--json", good], "accepted is another file than the record itself"),
+        (["--json", good], "accepted is a file that ends in .json"),
         (["--json", fifo], "accepted is a new file, or a regular one to replace"),
         (["--json", tmp_path], "accepted is a new file, or a regular one to replace"),
-        (["--json", tmp_path / "a.png", "--plot", tmp_path / "a.png"], "accepted is two files"),
+        (["--plot", good], "accepted is a file that ends in .png, .pdf, .svg"),
     ):
         assert cli.main(["analyze", str(good), *map(str, options)]) == 1
         printed = capsys.readouterr()

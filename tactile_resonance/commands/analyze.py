@@ -87,7 +87,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add_option(parser, "--from-rest", False, text)
     text = "with --calibration: modulus at the mode over that under the held force (default: 1)"
     add_option(parser, "--relaxed-ratio X", float, text)
-    add_output(parser, "--json FILE", "write the result here")
+    add_output(parser, "--json FILE", "write the result here", ".json")
     add_figure(parser, "--plot", "draw it here")
     option_of = {each.dest: each.option_strings[0] for each in parser._actions if each.option_strings}
     default_of = {name: parser.get_default(name) for name in option_of}
@@ -178,7 +178,6 @@ def run(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     """Nothing is written unless all went well."""
-    _check_outputs(options)
     _check_together(options)
     if options.point is not None:
         if options.measurement_id is not None:
@@ -279,16 +278,6 @@ def as_text(analysis: Analysis) -> str:
 
 def _std(value: float) -> str:
     return f"{value:.2g}" if np.isfinite(value) else "unknown"
-
-
-def _check_outputs(options: argparse.Namespace) -> None:
-    """Refuse an impossible output before any work is done."""
-    for name in ("json", "plot"):
-        if (path := getattr(options, name)) is not None:
-            own = path.exists() and options.record.exists() and path.samefile(options.record)
-            require(not own, f"--{name}", str(path), "another file than the record itself")
-    same = options.json is not None and options.json == options.plot
-    require(not same, "--json, --plot", str(options.json), "two files")
 
 
 def _check_together(options: argparse.Namespace) -> None:

@@ -16,7 +16,7 @@ from tactile_resonance.calibration.model import CalibratedSensor, Calibration, r
 from tactile_resonance.calibration.records import CalibrationRecord, Load
 from tactile_resonance.calibration.validity import check_in_air, poles_in_air
 from tactile_resonance.cantilever import tip_mass
-from tactile_resonance.commands.options import add_figure, add_option, add_output
+from tactile_resonance.commands.options import YAML, add_figure, add_option, add_output
 from tactile_resonance.fields import number, require
 from tactile_resonance.files import write_whole
 from tactile_resonance.front import read_record
@@ -52,7 +52,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add_option(parser, "--loopback RECORD", Path, text, **each)
     add_option(parser, "--modes", int, "default: as many as show in air")
     add_option(parser, "--sensor", "bimorph", "of config/sensors: its ball's radius")
-    add_output(parser, "--output FILE", "write the calibration here")
+    add_output(parser, "--output FILE", "write the calibration here", *YAML)
     add_figure(parser, "--plot", "draw responses and residuals here")
     add_option(parser, "--check FILE", Path, "compare one record in air with this calibration")
     text = "records of a simulated sensor that is a few percent off; compares with its truth"

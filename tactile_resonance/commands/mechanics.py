@@ -35,7 +35,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     add_option(parser, "--terms N", 4, "most terms")
     text = "of the tissue on what is rigid: whether Hertz's force holds"
     add_option(parser, "--thickness-m M", math.nan, text)
-    add_output(parser, "--json FILE", "write all figures")
+    add_output(parser, "--json FILE", "write all figures", ".json")
     add_figure(parser, "--plot", "draw force and model")
     of_files = parser.add_argument_group("files only: a run knows these")
     protocols = ("relaxation", "creep", "indentation")
@@ -46,7 +46,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     text = "the ball is held rigidly: indentation_m is its depth"
     add_option(of_files, "--rigid", False, text)
     add_option(of_files, "--poisson-ratio NU", 0.49)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, of_files=of_files._group_actions)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -56,6 +56,10 @@ def run(options: argparse.Namespace) -> int:
     check_options(
         options.terms, options.thickness_m
     )  # before a run's mechanics.csv is written anew
+    if all(path.is_dir() for path in options.paths):
+        for option in options.of_files:
+            value, (name,) = getattr(options, option.dest), option.option_strings
+            require(value == option.default, name, value, "none beside a run, which knows it")
     found = {path: list(_tests(path, options)) for path in options.paths}
     tests = [one for of_path in found.values() for one in of_path]
     if not tests:

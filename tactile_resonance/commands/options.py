@@ -14,6 +14,7 @@ from typing import Any
 from tactile_resonance.fields import require
 
 FIGURES = (".png", ".pdf", ".svg")
+YAML = (".yaml", ".yml")
 
 
 def add_option(
@@ -79,7 +80,10 @@ class _Output(argparse.Action):
 def add_output(
     parser: argparse._ActionsContainer, option: str, text: str, *endings: str, **more: Any
 ) -> None:
-    """An option that names a file to be written, checked as the arguments are read."""
+    """An option that names a file to be written, checked as the arguments are read.
+
+    The endings are those of its kind, so that no file of another kind, a record for example, is replaced.
+    """
     add_option(parser, option, Path, text, action=_Output, endings=endings, **more)
 
 

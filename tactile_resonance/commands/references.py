@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_resonance.commands.options import add_figure, add_option, add_output, add_runs
+from tactile_resonance.commands.options import YAML, add_figure, add_option, add_output, add_runs
 from tactile_resonance.fields import counted, require
 from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.front import read_run
@@ -56,7 +56,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "classes that follow as a file for `tissue_classes` of scenes, and try them on points left out.",
     )
     _add_runs(build)
-    add_output(build, "--output FILE", "the library", required=True)
+    add_output(build, "--output FILE", "the library", *YAML, required=True)
     text = "tissues scatter alike: estimate spreads from all together (few preparations of each)"
     add_option(build, "--pool", False, text)
     text = "what is left out of the classes that call it"

@@ -27,7 +27,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     text = "folder of a run; several: a comparison"
     add_option(parser, "run_folders RUN", Path, text, nargs="+")
     text = f"of a comparison (default: {COMPARISON}); the files of one run are in its folder"
-    add_output(parser, "--output FILE", text)
+    add_output(parser, "--output FILE", text, ".html")
     parser.set_defaults(run=run)
 
 

@@ -294,6 +294,9 @@ def test_refusals(tmp_path, capsys):
     message = called(check, capsys, status=1)
     assert "--figure: got" in message
     assert "x.docx'; accepted is a file that ends in .png, .pdf, .svg" in message
+    labels = tmp_path / "all.csv"
+    message = called(["references", "build", run, "--labels", labels, "--output", labels], capsys, status=1)
+    assert "all.csv'; accepted is a file that ends in .yaml, .yml" in message
     arguments = ["references", "build", run, "--labels", "scene", "--output", tmp_path / "x.yaml"]
     damaged = next((other / "recording").glob("point-00001*"))
     damaged.write_bytes(damaged.read_bytes()[:50])

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from benchmarks.mechanics import relaxation
+from tactile_resonance.cli import main
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
@@ -37,7 +38,7 @@ def made(point, asked):
     return replace(test, protocol=asked.kind)
 
 
-def test_tests_follow_the_poles_of_their_points_and_stand_in_their_files(tmp_path):
+def test_tests_follow_the_poles_of_their_points_and_stand_in_their_files(tmp_path, capsys):
     bench = Bench(tests=made)
     scan(tmp_path / "run", scene(3, protocols=(RELAXATION, CREEP)), bench)
     log = [entry for entry in bench.log if entry[0] in ("touch", "test")]
@@ -71,6 +72,10 @@ def test_tests_follow_the_poles_of_their_points_and_stand_in_their_files(tmp_pat
     assert kinds == [("2", "relaxation"), ("2", "creep"), ("3", "creep")]
     assert float(rows[0]["modulus_1s_pa"]) == value
     assert fits_at(run, run.latest[0]) == ()
+    for options in (["--rigid"], ["--radius-m", "0.002"], ["--protocol", "creep"]):
+        assert main(["mechanics", str(run.path), *options]) == 1
+        assert f"{options[0]}: got" in (told := capsys.readouterr()).err
+        assert told.err.endswith("accepted is none beside a run, which knows it\n")
 
 
 def test_a_test_that_fails_leaves_the_poles_and_says_why(tmp_path):
