@@ -79,6 +79,8 @@ def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
         return [
             "precision unknown: the scene has no regions to try it on; a simulated scan needs them"
         ]
+    if plan.scene.sensor.calibrated:
+        return ["precision unknown: it follows from the calibration, which the scene does not name"]
     lines, blocks, tried = [], [], set()
     for point in plan.first_points:
         tissue = phantoms.tissue_at(point.position_m)
@@ -96,10 +98,10 @@ def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
         )
         ended = "" if decision.verdict is Verdict.PRECISE else f"; {decision.verdict.value}"
         after = counted(decision.blocks, "block")
-        lines.append(f"on {tissue.name} (simulated) after {after}: {found}{ended}")
+        lines.append(f"on {tissue.name} (simulated), {HELD_S:g} s old, after {after}: {found}{ended}")
     if blocks:
         mean = round(sum(blocks) / len(blocks))
-        lines.append(f"time {plan.duration_s(mean):.0f} s")
+        lines.append(f"time {plan.duration_s(mean) + plan.search_s:.0f} s")
     return lines or ["precision unknown: no point lies on a region of the scene"]
 
 
@@ -107,6 +109,7 @@ def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, Decision]:
     """Poles of one point measured block by block, and the decision that ended it."""
     from tactile_resonance.frf.measurement import MeasurementFrf
     from tactile_resonance.poles.estimator import poles_of_bands
+    from tactile_resonance.poles.result import Poles, PolesStatus
     from tactile_resonance.scan.decision import decide
     from tactile_resonance.scan.measurement import excitation_of
     from tactile_resonance.simulation.sensor.bench import SimulatedBench
@@ -118,7 +121,10 @@ def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, Decision]:
     bench = SimulatedBench.from_configuration()
     at_rest = bench.start(tissue, force_n=scene.force_n, hold_time_s=HELD_S, seed=1)
     for blocks, record in enumerate(at_rest.play(excitation, excitation.periods), 1):
-        poles = poles_of_bands(frf.add(record, excitation), design.bands)
+        try:
+            poles = poles_of_bands(frf.add(record, excitation), design.bands)
+        except ValueError as error:  # as poles_node answers
+            poles = Poles(status=PolesStatus.FAILED, message=str(error))
         wanted = scene.nominal_contact, blocks, scene.precision, design.blocks, design.block_s
         decision = decide(poles, pressed, *wanted)
         if decision.stop:

@@ -116,6 +116,18 @@ class Plan:
         """With the most [s]."""
         return self.duration_s(self.measurement.blocks.most)
 
+    @property
+    def touches_before(self) -> int:
+        """For surface and normals, before the first point is measured."""
+        scene = self.scene
+        touches = len(scene.surface.points_m) if isinstance(scene.surface, TouchRequest) else 0
+        return touches + (scene.normals.touches * self.most_points if scene.normals else 0)
+
+    @property
+    def search_s(self) -> float:
+        """About what these take [s]."""
+        return self.touches_before * CONTACT_S
+
     def duration_s(self, blocks: int, points: int | None = None) -> float:
         """Of so many points, by default the most, with so many blocks each, and with the longest tests [s]."""
         count = self.most_points if points is None else points
@@ -247,9 +259,7 @@ def _in_mm(point: ScanPoint) -> str:
 def plan_rows(plan: Plan) -> list[tuple[str, str]]:
     """What a scan will excite, compute, publish and draw, with names for people."""
     scene, design, count = plan.scene, plan.measurement, plan.most_points
-    # touches before the first point is measured
-    before = len(scene.surface.points_m) if isinstance(scene.surface, TouchRequest) else 0
-    before += scene.normals.touches * count if scene.normals else 0
+    before = plan.touches_before
     stretches = " and ".join(f"{low:g} to {high:g}" for low, high in design.stretches_hz)
     at_most = "at most " if scene.adaptive else ""
     beside = f", {before} for surface and normals" if before else ""
@@ -302,7 +312,7 @@ def plan_rows(plan: Plan) -> list[tuple[str, str]]:
     if Output.MAP in scene.outputs:
         drawn += [*map_names(len(design.bands)), "map.mcap"]
     rows.append(("drawn", ", ".join(drawn)))
-    search = f", and about {before * CONTACT_S:.0f} s for surface and normals before" if before else ""
+    search = f", and about {plan.search_s:.0f} s for surface and normals before" if before else ""
     rows.append(("time", f"{plan.shortest_s:.0f} to {plan.longest_s:.0f} s{search}"))
     rows += [("limit", text) for text in _limits(plan)]
     for left in plan.skipped:

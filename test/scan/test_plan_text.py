@@ -119,8 +119,30 @@ def test_the_command_compiles_the_packages_own_scenes(capsys, tmp_path):
     assert main(["plan", str(path), "--figure", str(figure)]) == 0
     text = capsys.readouterr().out
     assert "16 points" in text
-    assert "expected  on gel10_gel16 (simulated) after" in text
+    assert "expected  on gel10_gel16 (simulated), 1 s old, after" in text
     assert figure.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        ("sensor: {order: 0, band_high_hz: 620, samples_per_period: auto}", ", 1 s old, after 3 blocks: f0 25"),
+        (
+            "sensor: {calibrated: true, band_high_hz: 400, samples_per_period: auto}",
+            "precision unknown: it follows from the calibration, which the scene does not name",
+        ),
+        ("normals: {}", "time 10 s"),
+    ],
+    ids=["one block has no order", "calibrated", "touches for normals"],
+)
+def test_what_a_plan_expects(more, expected, tmp_path, capsys):
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        f"force_n: 0.01\npositions: {{list: [[0, 0]]}}\n{more}\nprecision: {{f0_std_hz: 0.2}}\n"
+        "regions: [{gelatine_percent: 10, disc: {center_m: [0, 0], radius_m: 0.02}}]\n"
+    )
+    assert main(["plan", str(path)]) == 0
+    assert expected in capsys.readouterr().out
 
 
 def test_a_run_of_an_earlier_version_is_read_with_outputs_that_are_refused_today(tmp_path):
