@@ -285,8 +285,9 @@ def hum(x: _Channel) -> Fault | None:
     """Mains frequency and its harmonics, at bins that are not excited.
 
     Spoils the FRF only where an excited line lies within the bins that the local polynomial method
-    draws on. Hum that falls exactly on a harmonic of several periods cannot be seen: it looks like
-    excitation or distortion.
+    draws on. Records shorter than ten periods of the mains are not tested: a resonance that starts from rest
+    stands out of their floor as hum does. Hum that falls exactly on a harmonic of several periods cannot be
+    seen: it looks like excitation or distortion.
     """
     lines = np.asarray(x.harmonics, np.int64).tobytes()
     count, places = _hum_places(x.sample_rate_hz, *x.samples.shape, lines)
@@ -337,6 +338,8 @@ def _hum_places(
     away = np.arange(*_HUM_FLOOR_BINS)
     places: dict[float, list] = {mains: [] for mains in MAINS_HZ}
     for mains in MAINS_HZ:
+        if _HUM_FLOOR_BINS[0] * resolution > mains:
+            continue  # the floor would lie beyond the next harmonic, where the response is another one
         for k in range(1, MAINS_HARMONICS + 1):
             centre = round(k * mains / resolution)
             around, peak = (

@@ -224,6 +224,18 @@ def test_hum(record, mains, near):
     assert fault.spoils is near
 
 
+@pytest.mark.parametrize("periods", [2, 3, 5])
+def test_a_resonance_that_starts_from_rest_is_no_hum(periods, multisine):
+    """Blocks of 20 ms, as of a calibrated sensor: before, hum at 100 to 300 Hz."""
+    harmonics = np.arange(4, 9)
+    u = np.tile(multisine(harmonics, 1000, np.random.default_rng(3), amplitude=0.1), periods)
+    pole = np.exp(2 * np.pi * (-0.035 + 1j) * 250 / 50e3)
+    y = signal.lfilter([1 - abs(pole)], [1, -2 * pole.real, abs(pole) ** 2], u)
+    y = (y + 1e-4 * y.std() * np.random.default_rng(4).standard_normal(y.size)).reshape(periods, 1000)
+    report = find_faults(Spectrum.of(u.reshape(y.shape), y), sample_rate_hz=50e3, harmonics=harmonics)
+    assert FaultKind.HUM not in kinds(report)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_what_rounding_leaves_is_no_hum(seed):
     """Records without noise: before, hum of 1e-17 V."""
