@@ -17,7 +17,7 @@ from scipy import special
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles import likelihood
-from tactile_resonance.poles.compiled import entry
+from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     DenseSolution,
@@ -90,11 +90,21 @@ class WeightedLines:
         poles = plan.poles_in_band(theta)
         sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)[1]  # (batch, places, a)
         taken = sensitivity @ solution.marginal[:, 0, : sensitivity.shape[-1]]
+        taken = np.stack([taken.real, taken.imag], axis=2)
         phase = np.empty(0) if plan._delay_phase is None else plan._delay_phase
-        basis_a, basis_b, _ = problem.driven_bases
-        of_modes = _at_modes(taken, theta, basis_a, basis_b, phase, self.data, self.sample)
+        bases = (np.stack([of.real.T, of.imag.T]) for of in problem.driven_bases[:2])
+        ratio, squares = _at_modes(taken, theta, *bases, phase, self.data, self.sample)
         each = known.dof if known.independent_dof is None else known.independent_dof
-        return np.where(known.kind < 2, at_modes(of_modes[0], each / of_modes[1]), 1.0)
+        return np.where(known.kind < 2, at_modes(ratio, each / squares), 1.0)
+
+
+@inner
+def _add_series(coefficients, basis, sums):
+    """Add the series of real coefficients over the first rows of a basis (2, terms, K) to sums (2, K)."""
+    for part in range(2):
+        for i in range(coefficients.size):
+            for k in range(sums.shape[1]):
+                sums[part, k] += coefficients[i] * basis[part, i, k]
 
 
 @entry
@@ -102,58 +112,62 @@ def _at_modes(taken, theta, basis_a, basis_b, phase, data, sample):
     """Of the lines that poles are known from, the mean ratio of a sample's variance to that of the data.
 
     And the sum of the squares of their shares in the variance, both (points, places, 2) for the real and the
-    imaginary part. `taken` (points, places, n) are the derivatives of poles by the gradient of the cost, of
-    coefficients theta (points, n) over the bases; `phase` (K,) is that of a unit of delay, if there is one.
+    imaginary part. `taken` (points, places, 2, n) are the derivatives of these by the gradient of the cost, of
+    coefficients theta (points, n) over the bases (2, terms, K), real and imaginary part; `phase` (K,) is that
+    of a unit of delay, if there is one.
     """
-    points, places, n = taken.shape
-    bins, a, b = basis_a.shape[0], basis_a.shape[1] - 1, basis_b.shape[1]
+    points, places, _, n = taken.shape
+    bins, a, b = basis_a.shape[2], basis_a.shape[1] - 1, basis_b.shape[1]
     ratios, squares = np.empty((points, places, 2)), np.empty((points, places, 2))
-    share, ratio, slope = np.empty((places, 2, bins)), np.empty(bins), np.empty(n, np.complex128)
+    variance, ratio, weight, g = np.empty(bins), np.empty(bins), np.empty(bins), np.empty((2, bins))
+    of_a, of_b, by_a, by_b = np.empty((2, bins)), np.empty((2, bins)), np.empty((2, bins)), np.empty((2, bins))
     for point in range(points):
+        of_a[:], of_b[:] = basis_a[:, a], 0.0
+        _add_series(theta[point, :a], basis_a, of_a)
+        _add_series(theta[point, a : a + b], basis_b, of_b)
         same = min(point, data.u.shape[0] - 1)
         for k in range(bins):
-            of_a, of_b = basis_a[k, a], 0j
-            for i in range(a):
-                of_a += theta[point, i] * basis_a[k, i]
-            for i in range(b):
-                of_b += theta[point, a + i] * basis_b[k, i]
-            g = of_b / of_a
-            for i in range(a):
-                slope[i] = -g * basis_a[k, i]
-            for i in range(b):
-                slope[a + i] = basis_b[k, i]
-            if phase.size:
-                slope[n - 1] = -1j * phase[k] * of_b
-                g *= np.exp(-1j * phase[k] * theta[point, n - 1])
-            variance, ratio[k] = data.variance_y[point, k], sample.variance_y[point, k]
-            if data.variance_u.shape[1] > 0:
-                power = g.real * g.real + g.imag * g.imag
-                variance += data.variance_u[point, k] * power
+            inverse = 1 / (of_a[0, k] * of_a[0, k] + of_a[1, k] * of_a[1, k])
+            g[0, k] = (of_b[0, k] * of_a[0, k] + of_b[1, k] * of_a[1, k]) * inverse
+            g[1, k] = (of_b[1, k] * of_a[0, k] - of_b[0, k] * of_a[1, k]) * inverse
+            u = data.u[same, 0, k]
+            weight[k] = (u.real * u.real + u.imag * u.imag) * inverse
+        for k in range(bins):
+            variance[k], ratio[k] = data.variance_y[point, k], sample.variance_y[point, k]
+        if data.variance_u.shape[1] > 0:
+            for k in range(bins):
+                power = g[0, k] * g[0, k] + g[1, k] * g[1, k]
+                variance[k] += data.variance_u[point, k] * power
                 ratio[k] += sample.variance_u[point, k] * power
-            if data.covariance_yu.shape[1] > 0:
-                variance -= 2 * (data.covariance_yu[point, k] * g.conjugate()).real
-                ratio[k] -= 2 * (sample.covariance_yu[point, k] * g.conjugate()).real
-            used, u = variance < np.inf, data.u[same, 0, k]
-            weight = 0.0
-            if used:
-                weight = (u.real * u.real + u.imag * u.imag) / (of_a.real * of_a.real + of_a.imag * of_a.imag)
-                weight /= variance
-            ratio[k] = ratio[k] / variance if used else 0.0
-            for place in range(places):
-                re, im = 0j, 0j
-                for i in range(n):
-                    re += taken[point, place, i].real * slope[i]
-                    im += taken[point, place, i].imag * slope[i]
-                share[place, 0, k] = weight * (re.real * re.real + re.imag * re.imag)
-                share[place, 1, k] = weight * (im.real * im.real + im.imag * im.imag)
+        if data.covariance_yu.shape[1] > 0:
+            for k in range(bins):
+                turned = complex(g[0, k], -g[1, k])
+                if phase.size:
+                    turned *= np.exp(1j * phase[k] * theta[point, n - 1])
+                variance[k] -= 2 * (data.covariance_yu[point, k] * turned).real
+                ratio[k] -= 2 * (sample.covariance_yu[point, k] * turned).real
+        for k in range(bins):  # 0 where it is infinite
+            inverse = 1 / variance[k]
+            ratio[k] *= inverse
+            weight[k] *= inverse
         for place in range(places):
             for part in range(2):
+                by = taken[point, place, part]
+                by_a[:], by_b[:] = 0.0, 0.0
+                _add_series(by[:a], basis_a, by_a)
+                _add_series(by[a : a + b], basis_b, by_b)
+                if phase.size:
+                    for k in range(bins):
+                        by_b[0, k] += by[n - 1] * phase[k] * of_b[1, k]
+                        by_b[1, k] -= by[n - 1] * phase[k] * of_b[0, k]
                 total = mean = square = 0.0
                 for k in range(bins):
-                    value = share[place, part, k]
-                    total += value
-                    mean += value * ratio[k]
-                    square += value * value
+                    re = by_b[0, k] - g[0, k] * by_a[0, k] + g[1, k] * by_a[1, k]
+                    im = by_b[1, k] - g[0, k] * by_a[1, k] - g[1, k] * by_a[0, k]
+                    share = weight[k] * (re * re + im * im)
+                    total += share
+                    mean += share * ratio[k]
+                    square += share * share
                 ratios[point, place, part], squares[point, place, part] = mean / total, square / (total * total)
     return ratios, squares
 

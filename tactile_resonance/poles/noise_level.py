@@ -150,9 +150,12 @@ def at_modes(ratio: FloatArray, dof: FloatArray) -> FloatArray:
     dof : (batch, places, 2) float
         Complex degrees of freedom of it: those of a line over the sum of the squares of these shares.
     """
-    weight = np.maximum(1 - special.gammaincc(dof, dof * ratio) / CHANCE, 0)
-    factor = 1 + weight * np.maximum(ratio * student_variance(np.maximum(dof, 2)) - 1, 0)
-    return np.asarray(np.where(np.isfinite(factor), factor, 1.0).max(axis=(1, 2), initial=1.0))
+    more = ratio * student_variance(np.maximum(dof, 2)) - 1
+    above = (more > 0) & np.isfinite(more)
+    chance = special.gammaincc(dof[above], dof[above] * ratio[above])
+    factor = np.ones(ratio.shape)
+    factor[above] += np.maximum(1 - chance / CHANCE, 0) * more[above]
+    return np.asarray(factor.max(axis=(1, 2), initial=1.0))
 
 
 def moments_of_ratio(dof: int) -> tuple[float, float]:
