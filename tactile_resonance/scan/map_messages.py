@@ -20,6 +20,7 @@ from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.pole_map import EllipseScale, PoleMap, colours, shares
 
 NO_CLASS = 255  # of the field tissue_class: none called, or unknown
+NO_STATUS = 255  # of the field status: unknown, as of results of earlier versions
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
 _FIELD, _MARKER = "sensor_msgs/msg/PointField", "visualization_msgs/msg/Marker"
 Message = Any  # of rosbags
@@ -56,7 +57,7 @@ def cloud_message(pole_map: PoleMap, names: tuple[str, ...], header: Message) ->
         found = point.result
         figures = found.f0_hz, found.damping_ratio, found.f0_std_hz, found.damping_ratio_std
         called = number.get(found.tissue_class, NO_CLASS)
-        status = _STATUS.get(found.poles_status, 0)
+        status = _STATUS.get(found.poles_status, NO_STATUS)
         of_contact = found.force_n, found.tissue_probability
         rows.append((*point.position_m, *figures, *of_contact, called, status, b""))
     return _cloud(np.array(rows, POINT), header)

@@ -361,6 +361,10 @@ def test_a_run_s_results_make_the_same_point():
     cloud = cloud_message(again, (), header_message("table", 1))
     (row,) = np.frombuffer(cloud.data.tobytes(), POINT)
     assert row["status"] == POLES_STATUS[PolesStatus.MODEL_ERROR]
+    unknown = GrowingMap([replace(result, poles_status="")]).map
+    cloud = cloud_message(unknown, (), header_message("table", 1))
+    (row,) = np.frombuffer(cloud.data.tobytes(), POINT)
+    assert row["status"] not in POLES_STATUS.values()
     lost = replace(result, outcome=PointOutcome.FAILED, reason="contact lost")
     (failed,) = GrowingMap([result, lost]).map.failures
     assert failed.result.reason == "contact lost"
