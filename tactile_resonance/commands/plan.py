@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,7 +74,10 @@ def read_phantoms(path: Path) -> PhantomScene | None:
 
 def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
     """Precision and blocks at the first point of each tissue, as the simulated bench measures them."""
+    from tactile_resonance.poles.result import PolesStatus
     from tactile_resonance.scan.decision import Verdict
+
+    sure = PolesStatus.OK, PolesStatus.NO_COVARIANCE
 
     if phantoms is None:
         return [
@@ -81,17 +85,20 @@ def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
         ]
     if plan.scene.sensor.calibrated:
         return ["precision unknown: it follows from the calibration, which the scene does not name"]
-    lines, blocks, tried = [], [], set()
+    lines, blocks, points = [], dict[str, int](), Counter[str]()
     for point in plan.first_points:
         tissue = phantoms.tissue_at(point.position_m)
-        if tissue is None or tissue.name in tried:
+        if tissue is None:
             continue
-        tried.add(tissue.name)
+        points[tissue.name] += 1
+        if tissue.name in blocks:
+            continue
         poles, decision = _rehearsed(plan, tissue)
-        blocks.append(decision.blocks)
+        blocks[tissue.name] = decision.blocks
         found = ", ".join(
             f"f0 {of.main.f0_hz:.2f} +- {of.main.std[0]:.2g} Hz, damping ratio "
             f"{of.main.damping_ratio:.5f} +- {of.main.std[1]:.1g}"
+            + ("" if of.status in sure else f", {of.status.value}")
             if of.main.found
             else f"no pole from {of.band_hz[0]:g} to {of.band_hz[1]:g} Hz: {of.status.value}"
             for of in poles.bands
@@ -100,8 +107,9 @@ def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
         after = counted(decision.blocks, "block")
         lines.append(f"on {tissue.name} (simulated), {HELD_S:g} s old, after {after}: {found}{ended}")
     if blocks:
-        mean = round(sum(blocks) / len(blocks))
-        lines.append(f"time {plan.duration_s(mean) + plan.search_s:.0f} s")
+        mean = round(sum(blocks[name] * count for name, count in points.items()) / points.total())
+        at_most = "at most " if plan.scene.adaptive else ""
+        lines.append(f"time {at_most}{plan.duration_s(mean) + plan.search_s:.0f} s")
     return lines or ["precision unknown: no point lies on a region of the scene"]
 
 

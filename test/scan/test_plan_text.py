@@ -5,15 +5,18 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tactile_resonance.cli import main
+from tactile_resonance.commands import plan
 from tactile_resonance.configuration import share_path
 from tactile_resonance.mechanics.indentation import Protocol
+from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import PoleBand
-from tactile_resonance.scan.decision import BlockLimits, Gate, Precise, Verdict, decide
+from tactile_resonance.scan.decision import BlockLimits, Decision, Gate, Precise, Verdict, decide
 from tactile_resonance.scan.plan import CONTACT_S, make_plan, plan_against_outcome, plan_rows
 from tactile_resonance.scan.scene import Output, TimeLimits, read_run_scene, read_scan_scene
 from tactile_resonance.scan.surface import NormalRequest, TouchRequest
@@ -143,6 +146,31 @@ def test_what_a_plan_expects(more, expected, tmp_path, capsys):
     )
     assert main(["plan", str(path)]) == 0
     assert expected in capsys.readouterr().out
+
+
+def test_what_is_expected_names_a_status_that_is_not_ok_and_counts_each_point(monkeypatch):
+    """Three points of one tissue after 4 blocks, one of another after 40: 13 blocks a point."""
+    made = make_plan(scene(points=4))
+    tissues = {point.position_m: SimpleNamespace(name="gel") for point in made.first_points[:3]}
+    phantoms = SimpleNamespace(tissue_at=lambda at: tissues.get(at, SimpleNamespace(name="ball")))
+    w = 2 * np.pi * 250.0
+    poles = Poles(
+        poles_rad_s=np.array([-0.03 * w + 1j * w]),
+        f0_hz=np.array([250.0]),
+        damping_ratio=np.array([0.03]),
+        residues=np.ones(1, complex),
+        covariance=np.diag([0.02**2, 1e-8])[None],
+    )
+    measured = {
+        "gel": (replace(poles, status=PolesStatus.OK), Decision(Verdict.PRECISE, 4)),
+        "ball": (replace(poles, status=PolesStatus.MODEL_ERROR), Decision(Verdict.MOST_BLOCKS, 40)),
+    }
+    monkeypatch.setattr(plan, "_rehearsed", lambda _, tissue: measured[tissue.name])
+    gel, ball, time = plan._expected(phantoms, made)
+    pole = "f0 250.00 +- 0.02 Hz, damping ratio 0.03000 +- 0.0001"
+    assert gel == f"on gel (simulated), 1 s old, after 4 blocks: {pole}"
+    assert ball == f"on ball (simulated), 1 s old, after 40 blocks: {pole}, model error; most blocks reached"
+    assert time == f"time {made.duration_s(13) + made.search_s:.0f} s"
 
 
 def test_a_run_of_an_earlier_version_is_read_with_outputs_that_are_refused_today(tmp_path):
