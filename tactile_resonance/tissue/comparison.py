@@ -166,7 +166,8 @@ class Clusters:
     covariance : (K, 2, 2) float
         Of each group, without noise.
     probability : (n, K) float
-        With which each point belongs to each, if the groups are as they were found: of few points too sure.
+        With which each point belongs to each, by what the other points say of the groups; their number is
+        taken for true.
     bic : (Kmost,) float
         Bayesian information criterion of one group, two groups and so on, of fewer than 25 points as of 25; the
         number chosen has the least.
@@ -233,6 +234,8 @@ def find_clusters(
     counted = np.log(max(n, _FEWEST_COUNTED))
     bic = np.array([p * counted - 2 * m[-1] for p, m in zip(parameters, tried, strict=True)])
     weight, mean, covariance, probability, _ = tried[int(np.argmin(bic))]
+    if len(mean) > 1:
+        probability = _by_others(x / unit, noise / scale, covariance, probability, spread is not None)
     order = np.argsort(mean[:, 0])
     covariance = covariance[order] * scale
     return Clusters(weight[order], mean[order] * unit, covariance, probability[:, order], bic)
@@ -286,6 +289,30 @@ def _mixture(
         alike = _ALIKE_POINTS * sums_of.sum(axis=0) / n
         covariance = (sums_of + alike) / (members + _ALIKE_POINTS)[:, None, None]
     return weight, mean, covariance, probability, log_likelihood
+
+
+def _by_others(
+    x: FloatArray, noise: FloatArray, covariance: FloatArray, probability: FloatArray, known: bool
+) -> FloatArray:
+    """(n, K) probabilities of groups, each group as the other points (n, 2) show it.
+
+    Its mean is as uncertain as these leave it, with a wide distribution about all points before them. Where
+    the covariance was not known beforehand, deviations are Student's, with a degree of freedom for each.
+    A point that had a say in the mean it is compared with would be nearer to it than a new one.
+    """
+    total = noise[:, None] + covariance
+    inverse = np.linalg.inv(total)
+    own = probability[..., None, None] * inverse
+    pull = np.einsum("nkij,nj->nki", own, x - x.mean(axis=0))
+    of_mean = np.linalg.inv(own.sum(axis=0) - own + np.eye(2) / 4)
+    off = x[:, None] - x.mean(axis=0) - np.einsum("nkij,nkj->nki", of_mean, pull.sum(axis=0) - pull)
+    total = total + of_mean
+    squared = _squared(off, total)
+    members = probability.sum(axis=0) - probability
+    degrees = members + _ALIKE_POINTS - 1
+    shape = -squared / 2 if known else -(degrees + 2) / 2 * np.log1p(squared / degrees)
+    log = np.log(members + 1) + shape - np.linalg.slogdet(total)[1] / 2
+    return np.asarray(special.softmax(log, axis=1))
 
 
 def _seeds(x: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
