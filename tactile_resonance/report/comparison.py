@@ -165,13 +165,15 @@ def sentence(name: str, first: str, found: Sequence[Difference], apart: Sequence
     which = {0: "as measured", len(found): "at the nominal contact"}.get(
         nominal, f"at the nominal contact at {nominal} of them, else as measured"
     )
+    # the deviations of poles as measured are of noise alone
+    included = "" if nominal == len(found) else ", force and age of contact included"
     beside = f" Beside what was touched they differ by {'; '.join(apart)}." if apart else ""
     return (
         f"{name} less {first}, {counted(len(found), 'place')} in common, poles {which}: differences of f0 have "
         f"an rms of {rms[0]:.2f} of their standard deviations, at most {largest[0]:.1f}, those of the damping "
         f"ratio {rms[1]:.2f}, at most {largest[1]:.1f}; {counted(beyond, 'place')} {differ} by more than "
         f"{SIGNIFICANT:g}. Were "
-        f"nothing different, chance would give as much or more with probability {chance:.2g}.{beside}"
+        f"nothing different{included}, chance would give as much or more with probability {chance:.2g}.{beside}"
     )
 
 

@@ -112,7 +112,10 @@ def test_poles_at_the_nominal_contact_are_compared_where_both_are_known():
     assert each.deviations[0] == pytest.approx(0.3 / (0.06 * np.sqrt(2)))
     found = differences(first, drawn(1, 2))
     assert not found[0].nominal
-    assert "1 place in common, poles as measured" in sentence("b", "a", found)
+    told = sentence("b", "a", found)
+    assert "1 place in common, poles as measured" in told
+    assert "Were nothing different, force and age of contact included, chance" in told
+    assert "Were nothing different, chance" in sentence("b", "a", [each])
     mixed = replace(drawn(2, 1), results=(*first.results, drawn(2, 1).results[1]))
     told = sentence("b", "a", differences(mixed, mixed))
     assert "2 places in common, poles at the nominal contact at 1 of them, else as measured" in told
