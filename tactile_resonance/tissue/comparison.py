@@ -134,6 +134,9 @@ def _checked(
     ):
         good = array.shape == shape and n > 0 and bool(np.all(np.isfinite(array)))
         require(good, name, array.shape, f"shape {shape}, finite, of one point or more")
+    total = c + w
+    above = (total[:, 0, 0] > 0) & (np.linalg.det(total) > 0)
+    require(bool(above.all()), "covariances", c[~above][:1].tolist(), "positive definite ones, with the spread")
     return x, c, w
 
 

@@ -223,3 +223,13 @@ def test_refusals():
         find_clusters([], [])
     with pytest.raises(ValueError, match="most: got 0"):
         find_clusters([MEAN], [NOISE], most=0)
+
+
+@pytest.mark.parametrize("covariance", [np.zeros((2, 2)), -NOISE, np.diag([1e-4, 0.0])])
+@pytest.mark.parametrize("of", [differences_from_rest, pairs_that_differ])
+def test_points_without_a_covariance_are_neither_compared_nor_grouped(of, covariance):
+    x, noise, none = np.array([[250.0, 0.03], [251.0, 0.03]]), np.stack([covariance, NOISE]), np.zeros((2, 2))
+    with pytest.raises(ValueError, match="covariances: got .* accepted is positive definite ones"):
+        of(x, noise, none)
+    with pytest.raises(ValueError, match="covariances: got .* accepted is positive definite ones"):
+        find_clusters(x, noise)
