@@ -45,6 +45,7 @@ class ForceWatch:
         self._stuck_samples = stuck_samples
         self._equal = 1
         self._last: tuple[int, float] | None = None  # time and force along z of the newest
+        self._last_across, self._others_moved = (0.0, 0.0), False  # along x and y, while z was equal
         self._times_ns: deque[int] = deque(maxlen=RECENT)
         self._forces_n: deque[float] = deque(maxlen=RECENT)  # along z, at these times
         self._mean_ns = round(mean_s * 1e9)
@@ -90,12 +91,19 @@ class ForceWatch:
             if since_ns <= 0:
                 text = f"time of forces does not ascend: {time_ns} after {last_ns} ns"
                 return Breach(Cause.FORCE_INVALID, text)
-            self._equal = self._equal + 1 if z == last_n else 1
+            if z == last_n:
+                self._equal += 1
+                self._others_moved = self._others_moved or (x, y) != self._last_across
+            else:
+                self._equal, self._others_moved = 1, False
             if self._equal >= self._stuck_samples:
-                self._last = time_ns, z
-                text = f"{self._equal} equal forces in a row: the sensor is stuck"
+                self._last, self._last_across = (time_ns, z), (x, y)
+                why = "the sensor is stuck"
+                if self._others_moved:
+                    why = "z is stuck, or its noise does not show (filter, coarse steps: stuck_samples)"
+                text = f"{self._equal} equal forces in a row: {why}"
                 return Breach(Cause.FORCE_STUCK, text)
-        self._last = time_ns, z
+        self._last, self._last_across = (time_ns, z), (x, y)
         z -= inertia_n
         if self._bias_n is not None:
             bias_x, bias_y, bias_z = self._bias_n

@@ -222,6 +222,22 @@ def test_bad_force_is_not_used(sample, cause):
     assert watch.force_n[2] == 0.01
 
 
+@pytest.mark.parametrize(
+    ("across_n", "reason"),
+    [(0.0, "10 equal forces in a row: the sensor is stuck"), (1e-3, "z is stuck, or its noise does not show")],
+)
+def test_a_force_that_repeats_is_stuck_and_told_from_a_sensor_whose_other_axes_move(across_n, reason):
+    watch = ForceWatch(10, 0.05)
+    rng = np.random.default_rng(1)
+    breaches = [
+        watch.add(WrenchSample(n, (*vector(across_n * rng.standard_normal(3))[:2], 0.01), ZERO))
+        for n in range(10)
+    ]
+    assert breaches[:-1] == 9 * [None]
+    assert breaches[-1].cause is Cause.FORCE_STUCK
+    assert reason in breaches[-1].message
+
+
 def test_rate_of_a_ramp_is_its_slope():
     rng = np.random.default_rng(0)
     ramp = [[0, 0, 0.5 * 0.002 * n + 1e-4 * rng.standard_normal()] for n in range(50)]
