@@ -85,7 +85,8 @@ class ContactResult:
         The same in a sentence.
     force_n, force_std_n : float or None
         Mean of the measured force since it was reached, and its standard deviation from noise and
-        tare [N]; None where it was not reached.
+        tare [N]; of the moment when it was, the force of the model, and the arm's vibration is in its
+        deviation. None where it was not reached.
     depth_m : float or None
         Past the first touch when reached [m].
     stiffness_n_per_m : float or None
@@ -160,13 +161,16 @@ class Outcome:
         self, now_ns: int, touched_ns: int, estimate: ContactEstimate, told_m: float | None
     ) -> None:
         """Note that the force is there."""
-        self._observer.begin_mean()
+        observer = self._observer
+        observer.begin_mean()
+        # the tip shakes about the height at which the model knows the force
+        shaken_n = estimate.stiffness_n_per_m * observer.parameters.arm_vibration_m
         self._result = ContactResult(
             reached=True,
             cause=Cause.NONE,
             message="",
             force_n=estimate.force_n,
-            force_std_n=math.hypot(estimate.force_std_n, self._observer.bias_std_n),
+            force_std_n=math.hypot(estimate.force_std_n, observer.bias_std_n, shaken_n),
             depth_m=estimate.depth_m,
             stiffness_n_per_m=estimate.stiffness_n_per_m,
             surface_m=estimate.surface_m,
@@ -174,7 +178,7 @@ class Outcome:
             surface_std_m=estimate.depth_std_m,
             contact_s=(now_ns - touched_ns) * 1e-9,
             total_s=(now_ns - self._start_ns) * 1e-9,
-            peak_force_n=self._observer.watch.peak_n,
+            peak_force_n=observer.watch.peak_n,
         )
 
     def ended(self, breach: Breach, now_ns: int, told_m: float | None, holding: bool) -> None:

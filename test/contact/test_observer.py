@@ -175,3 +175,13 @@ def test_a_zero_has_moved_beyond_four_deviations_of_the_forces_that_came(rate_hz
         outcome.ended(Breach(Cause.CANCELLED, ""), 500 * every_ns, None, holding=False)
         outcome.drawn_back(share * std_n)
         assert (outcome.result(holding=False).zero_change_n != 0.0) == moved
+
+
+def test_the_force_of_the_moment_when_it_is_reached_holds_the_vibration_of_the_arm():
+    """Of a tip that shakes by s about the height that is told, on a slope k, it is off by k s."""
+    observer = pressed(0, 0.0)
+    estimate = replace(observer.model.estimate(-PRESSED_M), force_std_n=0.0, stiffness_n_per_m=60.0)
+    outcome = Outcome(observer, 0)
+    outcome.reached(1, 0, estimate, None)
+    variance = outcome.result(holding=False).force_std_n ** 2 - observer.bias_std_n**2
+    assert math.sqrt(variance) == pytest.approx(60.0 * observer.parameters.arm_vibration_m)
