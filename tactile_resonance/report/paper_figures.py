@@ -109,10 +109,12 @@ def _responses(
     cases: dict[str, Any] = {}
     for path in run.paths(FRF_TYPE, reference=BEFORE)[:1]:
         for _, _, message in read_messages(path, FRF_TYPE):
-            cases["free air"] = message
+            if len(message.frequency_hz):  # else it failed
+                cases["free air"] = message
     for name, results in list(classes.items())[:_MOST_CASES]:
         frfs = [(r, details[r.index].frf) for r in results if r.index in details]
-        first = next(((r, frf) for r, frf in frfs if frf is not None), None)
+        there = ((r, frf) for r, frf in frfs if frf is not None and len(frf.frequency_hz))
+        first = next(there, None)
         if first is not None:
             cases[f"{name}, point {first[0].index + 1}"] = first[1]
     traces, several = [], False

@@ -306,6 +306,15 @@ def test_what_is_not_known_of_distortion_is_not_called_noise(hostile, monkeypatc
     assert [t["name"] for t in figure["traces"][::2]] == ["even lines", "odd lines"]
 
 
+def test_an_frf_that_failed_leaves_its_figure_out_and_no_more(hostile):
+    """Its arrays are empty, as of a reference in air with faults."""
+    empty = {name: np.empty(0) for name in ("frequency_hz", "real", "imag", "variance_noise", "variance_total")}
+    run = read_run(hostile[0])
+    details = {r.index: point_details.PointDetails(frf=SimpleNamespace(**empty)) for r in run.latest}
+    (figure,) = [f for f in paper_figures(run, details) if "(figure 5)" in f["title"]]
+    assert (figure["traces"], figure["note"].startswith("Left out: the recording holds no FRF")) == ([], True)
+
+
 def test_figures_of_the_paper_that_a_run_cannot_give_say_why(hostile):
     folder, _ = hostile
     figures = {re.search(r"\((.*)\)$", f["title"])[1]: f for f in data_of(folder)["figures"]}

@@ -217,7 +217,7 @@
   const DB = 20 / Math.LN10;
 
   function drawFrf(place, entries) {
-    const there = entries.filter(({ detail }) => detail && detail.frf);
+    const there = entries.filter(({ detail }) => detail && detail.frf && detail.frf.lines);
     const known = !there.length || there.some(({ detail }) => detail.frf.std.some((std) => std !== null));
     const title = known ? "frequency response, 95 % bars, and the model" : "frequency response of one period, with its transient; errors unknown";
     if (!there.length) return nothing(place, title, "no FRF of this point in the page");
