@@ -145,10 +145,13 @@ def _distortion(run: RunContent, details: Mapping[int, PointDetails]) -> list[Fi
         return [_figure(title, f"Left out: {why}.")]
     figures = []
     chosen = next((r for r in told if r.index in details), told[0])
-    measurements = measurements_of_file(file_of(run.path, chosen))
-    stored = next((m for m in measurements if m.measurement_id == chosen.measurement_id), None)
-    if stored is not None and stored.records:
-        figures.append(_output(recording_of(stored), f"point {chosen.index + 1}"))
+    try:
+        measurements = measurements_of_file(file_of(run.path, chosen))
+        stored = next((m for m in measurements if m.measurement_id == chosen.measurement_id), None)
+        if stored is not None and stored.records:
+            figures.append(_output(recording_of(stored), f"point {chosen.index + 1}"))
+    except ValueError as error:  # blocks that are missing, or a file of an earlier version
+        figures.append(_figure("Output and its distortion (figure 5)", f"Left out: {error}."))
     points, traces = [r.index + 1 for r in told], []
     first = [r.distortion[0] for r in told]
     for name, colour in _PARITIES.items():

@@ -305,6 +305,13 @@ def test_what_is_not_known_of_distortion_is_not_called_noise(hostile, monkeypatc
     assert "Points with more than noise, of 4: even 1, odd 0. Noise is unknown at 2." in figure["note"]
     assert [t["name"] for t in figure["traces"][::2]] == ["even lines", "odd lines"]
 
+    def refuse(_):
+        raise ValueError("measurement 7: of no realisation all periods are there")
+
+    monkeypatch.setattr("tactile_resonance.report.paper_figures.measurements_of_file", refuse)
+    (output,) = [f for f in paper_figures(run, {}) if f["title"].startswith("Output and its distortion")]
+    assert output["note"] == "Left out: measurement 7: of no realisation all periods are there."
+
 
 def test_an_frf_that_failed_leaves_its_figure_out_and_no_more(hostile):
     """Its arrays are empty, as of a reference in air with faults."""
