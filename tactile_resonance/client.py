@@ -251,9 +251,9 @@ class TactileClient:
             Scan.Goal,
             scene=str(scene),
             poses=_checked(PoseArray, header=header, poses=list(poses)),
-            force_n=float(force_n),
-            f0_std_hz=float(f0_std_hz),
-            damping_ratio_std=float(damping_ratio_std),
+            force_n=_number("force_n", force_n),
+            f0_std_hz=_number("f0_std_hz", f0_std_hz),
+            damping_ratio_std=_number("damping_ratio_std", damping_ratio_std),
             run_directory=str(run_directory),
             resume=resume,
             seed=seed,
@@ -299,11 +299,11 @@ class TactileClient:
         goal = _checked(
             CalibrateTable.Goal,
             points=list(points),
-            force_n=float(force_n),
-            search_m=float(search_m),
-            flatness_m=float(flatness_m),
-            most_tilt_rad=float(most_tilt_rad),
-            heading_rad=float(heading_rad),
+            force_n=_number("force_n", force_n),
+            search_m=_number("search_m", search_m),
+            flatness_m=_number("flatness_m", flatness_m),
+            most_tilt_rad=_number("most_tilt_rad", most_tilt_rad),
+            heading_rad=_number("heading_rad", heading_rad),
             sensor=sensor,
             file=str(file),
         )
@@ -420,6 +420,13 @@ class TactileClient:
         asked = self._asked
         if asked is not None and asked.on_point is not None:
             asked.on_point(message)
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"goal: {name}: got {value!r}; accepted is a number") from error
 
 
 def _checked(kind: type, **values: Any) -> Any:

@@ -159,9 +159,15 @@ def expanded(given: str, name: str) -> Path:
 
 
 def scene_path(scene: str) -> Path:
-    """Path of a scene file, absolute or in the package's share folder."""
+    """Path of a scene file, absolute or in the package's share folder; ``ValueError`` where it is not there."""
     path = expanded(scene, "scene")
-    return path if path.is_absolute() else share_path(path)
+    if path.is_absolute():
+        return path
+    try:
+        return share_path(path)
+    except (ValueError, FileNotFoundError) as error:
+        accepted = "a file of the package, config/scenes/demo.yaml for example, or a whole path"
+        raise ValueError(f"scene: got {scene!r}; accepted is {accepted}") from error
 
 
 def _without_file(goal: ScanGoal) -> dict[str, Any]:

@@ -114,7 +114,8 @@ def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(s
         ({"scene": stack.folder / "none.yaml"}, "none.yaml: cannot be read"),
         ({"run_directory": stack.folder / "full"}, "holds something; accepted is a new or empty"),
         ({"resume": True}, "accepted is the folder of a run, to resume it"),
-        ({"scene": "../../setup.py"}, "a path in"),
+        ({"scene": "../../setup.py"}, "scene: got '../../setup.py'; accepted is a file of the package"),
+        ({"scene": "none.yaml"}, "scene: got 'none.yaml'; accepted is a file of the package"),
         ({"scene": "/etc/passwd"}, "a path in"),
         ({"run_directory": "/etc/new"}, "run_directory: got '/etc/new'; accepted is a path in"),
         ({"run_directory": "../new"}, "(goal_folders of scan_node adds others)"),
@@ -141,6 +142,9 @@ def test_values_that_no_goal_can_hold_are_refused_at_once(stack, name, value):
     field = "frame_id" if name == "frame" else name
     with pytest.raises(ValueError, match=f"goal: The '{field}' field must be"):
         stack.client.scan(**{**GOAL, name: value})
+    for wrong in ("much", None):
+        with pytest.raises(ValueError, match=f"goal: force_n: got {wrong!r}; accepted is a number"):
+            stack.client.scan(**{**GOAL, "force_n": wrong})
     stack.activate()
     future = stack.begin([])  # another one is taken
     stack.client.cancel()

@@ -36,7 +36,10 @@ def test_scenes_are_those_of_the_package_and_of_the_folders(tmp_path):
     files = GoalFiles(str(tmp_path / "runs"), [str(tmp_path / "scenes")])
     for scene in ("config/scenes/demo.yaml", str(tmp_path / "scenes" / "a.yaml")):
         assert files.checked(ScanGoal(scene=scene)).scene == scene
-    for scene in ("config/../setup.py", str(tmp_path / "runs" / "a.yaml"), "/etc/passwd"):
+    for scene in ("nowhere.yaml", "../setup.py"):
+        with pytest.raises(ValueError, match="^scene: got .*; accepted is a file of the package"):
+            files.checked(ScanGoal(scene=scene))
+    for scene in (str(tmp_path / "runs" / "a.yaml"), "/etc/passwd"):
         with pytest.raises(ValueError, match="got .*; accepted is a path in"):
             files.checked(ScanGoal(scene=scene))
 
