@@ -119,15 +119,15 @@ def _read(path: Path, options: argparse.Namespace) -> IndentationRecord:
         )
     stiffness = math.inf if options.rigid else options.stiffness_n_per_m
     time_s, force_n, indentation_m = (arrays[name].ravel().astype(float) for name in COLUMNS)
-    return IndentationRecord(
-        Protocol(options.protocol),
-        time_s,
-        force_n,
-        indentation_m,
-        BallTip(options.radius_m, options.poisson_ratio, stiffness),
-        label=path.name,
-        source=path.name,
-    )
+    ball = BallTip(options.radius_m, options.poisson_ratio, stiffness)
+    try:
+        return IndentationRecord(
+            *(Protocol(options.protocol), time_s, force_n, indentation_m, ball),
+            label=path.name,
+            source=path.name,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from error
 
 
 def _lines(one: TissueTest) -> Iterator[str]:
@@ -145,7 +145,7 @@ def _lines(one: TissueTest) -> Iterator[str]:
     for at in (0.5, 1.0, 10.0, 60.0):
         value, std = fit.modulus(at)
         if math.isfinite(value):
-            yield f"  E({at:g} s)   {value:10.0f} Pa  +- {100 * std:.1f} %"
+            yield f"  E({at:g} s)   {_digits(value)} Pa  +- {100 * std:.1f} %"
     yield _constant("Einf", fit.equilibrium_pa, fit.equilibrium_std, fit.equilibrium_known.value)
     for k, term in enumerate(fit.terms, start=1):
         if term.known.value != "determined":
@@ -160,4 +160,9 @@ def _lines(one: TissueTest) -> Iterator[str]:
 def _constant(name: str, value: float, std: float, known: str) -> str:
     if known != "determined":
         return f"  {name:8s} {known}"
-    return f"  {name:8s} {value:10.0f} Pa  +- {100 * std:.1f} %"
+    return f"  {name:8s} {_digits(value)} Pa  +- {100 * std:.1f} %"
+
+
+def _digits(pascal: float) -> str:
+    """Whole, or three digits of a small one, as of a depth that is not in metres."""
+    return f"{pascal:10.0f}" if pascal >= 100 else f"{pascal:10.3g}"

@@ -60,6 +60,14 @@ def test_the_command_reads_a_file_and_needs_to_know_what_holds_the_ball(tmp_path
     # what a run holds would be written anew: wrong options are refused before anything is read
     assert cli.main([*command, "--rigid", "--terms", "0"]) == 1
     assert capsys.readouterr().err.endswith("most_terms: got 0; accepted is 1 to 6\n")
+    # in millimetres: what comes of it is said with its digits
+    for name, of in (("mm", 1.0), ("nan", np.nan)):
+        path = tmp_path / f"{name}.npz"
+        np.savez(path, **dict(zip(COLUMNS, columns.T * np.array([[1], [of], [1e3]]), strict=True)))
+        assert cli.main(["mechanics", str(path), *command[2:], "--rigid"]) == int(name == "nan")
+        printed = capsys.readouterr()
+        assert " 0 Pa" not in printed.out
+    assert printed.err.endswith("nan.npz: force_n: got 'nan at sample 0'; accepted is finite numbers\n")
     np.savez(tmp_path / "complex.npz", **dict(zip(COLUMNS, columns.T + 1j, strict=True)))
     assert cli.main(["mechanics", str(tmp_path / "complex.npz"), *command[2:], "--rigid"]) == 1
     assert "complex.npz: time_s: got 'complex numbers'" in capsys.readouterr().err
