@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -70,6 +71,8 @@ def command() -> NoReturn:
     was caught within an import makes it end by SIGINT.
     """
     status = 130
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a letter of a name that the terminal does not have
+        sys.stdout.reconfigure(errors="backslashreplace")
     with contextlib.suppress(KeyboardInterrupt):  # one that came as the command ended
         status = main()
         for number in ENDING:

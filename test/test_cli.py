@@ -150,3 +150,19 @@ def test_files_and_folders_taken_for_each_other_are_named(tmp_path, capsys):
     ):
         assert cli.main([os.fspath(argument) for argument in arguments]) == 1
         assert message in capsys.readouterr().err
+
+
+def test_a_letter_that_the_terminal_does_not_have_is_no_error(tmp_path):
+    """Before, a scene with an umlaut in its name ended `plan` in a terminal without one."""
+    scene = tmp_path / "scene.yaml"
+    scene.write_text("name: Gewölbe\nforce_n: 0.01\npositions: {list: [[0, 0]]}\n", "utf-8")
+    code = "from tactile_resonance.cli import command; command()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "plan", scene],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("plan of Gew\\xf6lbe\n")
