@@ -269,12 +269,15 @@ class StateReader:
         The same state, as the contract of an arm has it.
     fault : tuple of ArmFault and str, or None
         Why no command would be followed in it.
+    received : int
+        States so far.
     """
 
     def __init__(self, stream: RtdeStream, now_ns: Callable[[], int], round_trip_s: float) -> None:
         self.newest: RobotState | None = None
         self.sample: ArmSample | None = None
         self.fault: tuple[ArmFault, str] | None = None
+        self.received = 0
         self.stream, self._now_ns, self._trip_s = stream, now_ns, round_trip_s
         self._tracker = self._new_tracker()
         self._guarded = self._ended = False
@@ -310,6 +313,7 @@ class StateReader:
             for state in states:
                 if state.runtime_state != PROGRAM_PLAYING:
                     self._ended = True
+        self.received += len(states)
         before, self.newest = self.newest, states[-1]
         # a robot whose simulated time stands repeats its state
         if before is None or self.newest.robot_time_s != before.robot_time_s:

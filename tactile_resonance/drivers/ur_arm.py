@@ -107,6 +107,11 @@ class UrArm:
         return self._reader.clock_std_s
 
     @property
+    def received(self) -> int:
+        """States that have come over this connection; `state` gives the newest of them."""
+        return self._reader.received
+
+    @property
     def robot_port(self) -> int:
         """Local port of the connection over which the robot sends its states; 0: none."""
         return 0 if self._states is None else self._states.stream.local_port

@@ -54,6 +54,7 @@ def watch(config: UrArmConfig, seconds: float) -> tuple[str, bool]:
     """
     arm = UrArm(config)
     stamps: list[float] = []
+    counts: list[int] = []  # of all states until then: a look may find several
     ages: list[float] = []
     stale = 0
     try:
@@ -71,19 +72,21 @@ def watch(config: UrArmConfig, seconds: float) -> tuple[str, bool]:
             ages.append((arm.clock.now_ns() - sample.time_ns) * 1e-9)
             if not stamps or sample.robot_time_s != stamps[-1]:
                 stamps.append(sample.robot_time_s)
+                counts.append(arm.received)
             time.sleep(POLL_S)
         uncertainty_s = arm.clock_uncertainty_s
     finally:
         arm.close()
     if len(stamps) < 2:
         raise ArmError(ArmFault.STALE, f"{config.host}: no fresh states in {seconds:g} s")
-    gaps = np.diff(stamps)
-    duration_s = stamps[-1] - stamps[0]
-    missed = round(duration_s * config.rate_hz) - len(gaps)
+    duration_s, came = stamps[-1] - stamps[0], counts[-1] - counts[0]
+    # of a look at most: all others that it found were a period apart
+    gaps = np.diff(stamps) - (np.diff(counts) - 1) / config.rate_hz
+    missed = round(duration_s * config.rate_hz) - came
     median_ms, most_ms, largest_ms = 1e3 * np.quantile(ages, [0.5, 0.99, 1.0])
     lines = (
-        f"states: {len(gaps) / duration_s:.1f} Hz over {duration_s:.1f} s, {missed} missed",
-        f"longest gap: {gaps.max() * 1e3:.0f} ms",
+        f"states: {came / duration_s:.1f} Hz over {duration_s:.1f} s, {missed} missed",
+        f"longest gap: at most {gaps.max() * 1e3:.0f} ms",
         f"age: median {median_ms:.1f}, 99 % {most_ms:.1f}, largest {largest_ms:.1f} ms; limit "
         f"{config.max_state_age_s * 1e3:.0f} ms, beyond it {stale} times",
         f"clock of the robot: known to {uncertainty_s * 1e3:.2f} ms (1 sigma)",
