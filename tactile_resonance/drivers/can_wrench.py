@@ -282,9 +282,8 @@ class CanWrench:
         short_hz = self._flow.short(now_s, self.received + self.lost) if streams else None
         if short_hz is not None:
             text = f"{short_hz:.0f} wrenches/s of {self._config.info.rate_hz:.0f} arrive"
-            raise ForceError(
-                ForceFault.INCOMPLETE, f"{self._where}: {text}: the interface is too slow"
-            )
+            why = "the interface is too slow, or rate_hz is not the cell's"
+            raise ForceError(ForceFault.INCOMPLETE, f"{self._where}: {text}: {why}")
         return samples
 
     def _silence(self, bus: Bus, since_s: float) -> ForceError:
