@@ -30,6 +30,8 @@ def write_whole(path: Path, content: bytes, written: Callable[[], None] | None =
     ------
     ValueError
         If something other than a regular file stands there: a device would be replaced.
+    OSError
+        If it cannot be written, with its name.
     """
     if path.exists() and not path.is_file():
         raise ValueError(
@@ -46,6 +48,10 @@ def write_whole(path: Path, content: bytes, written: Callable[[], None] | None =
                 written()
             os.fsync(file.fileno())
         part.replace(path)
+    except OSError as error:
+        if error.filename is None:  # as of a write to a full disk
+            error.filename = str(path)
+        raise
     finally:
         if not told:
             part.unlink(missing_ok=True)
