@@ -153,12 +153,19 @@ class ScanRunner:
             latest = max(content.results, key=lambda result: result.time_ns)
             return self._last or content.points[latest.index]
         if request is Request.SKIP and point is not None:
+            if self._is_done(point):  # to be repeated: what was measured before counts
+                return self._next()
             with self._run.begin_point(point.index) as recording:
                 result = self._ended(point, recording, PointOutcome.SKIPPED, SKIPPED, 0.0)
                 self._publish(recording.finish(result))
                 self._last = point
             return self._next()
         return point
+
+    def _is_done(self, point: ScanPoint) -> bool:
+        """Whether an earlier attempt at a point counts, with its poles."""
+        done = (of for of in self._run.content.latest if of.outcome is PointOutcome.DONE)
+        return any(of.index == point.index for of in done)
 
     def _wait(self) -> None:
         """With the tip free, while the scan is paused or a node is held, and until all are at work."""
@@ -201,7 +208,7 @@ class ScanRunner:
                 raise PointFailed(f"time_limits.point_s: {longest_s:g} s are over")
 
         with self._run.begin_point(point.index) as recording:
-            measured, outcome, reason = None, PointOutcome.FAILED, ""
+            measured, outcome, reason, leaves = None, PointOutcome.FAILED, "", False
             # of the contact in which it is measured: those of tests follow
             moved_n, spent_s, not_tested = 0.0, None, ""
             # a point that is repeated on request has phases and noise of its own
@@ -234,15 +241,18 @@ class ScanRunner:
                 reason = str(error)
             except Interrupted:
                 outcome, reason = PointOutcome.SKIPPED, SKIPPED
-                if self._controls.take() is not Request.SKIP:  # cancelled or to be repeated
+                leaves = self._controls.take() is Request.SKIP
+                if not leaves:  # cancelled or to be repeated
                     outcome, reason = PointOutcome.DISCARDED, LEFT
+                elif self._is_done(point):  # what was measured before counts
+                    outcome = PointOutcome.DISCARDED
             except ScanEnded as error:
                 self._discard(point, recording, str(error))
                 raise
             if outcome is PointOutcome.DISCARDED:
                 self._hands.retract()
                 self._discard(point, recording, reason)
-                self._again = point
+                self._again = None if leaves else point
                 return
             self._say(point, Phase.RETRACT)
             left_n = self._hands.retract()

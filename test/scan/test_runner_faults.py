@@ -106,6 +106,41 @@ def test_a_finished_point_whose_repetition_is_disturbed_or_left_is_repeated_all_
     assert [(r.index, r.attempt) for r in run.results] == [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)]
 
 
+@pytest.mark.parametrize("in_contact", [False, True])
+def test_a_repetition_that_is_skipped_leaves_the_point_as_it_was_measured(tmp_path, in_contact):
+    controls, wanted = Controls(), [([0, 1, 1], Request.SKIP), ([0, 1], Request.REPEAT)]
+
+    def ask(touched):
+        if wanted and wanted[-1][0] == touched:
+            controls.ask(wanted.pop()[1])
+
+    class Skipped(Bench):
+        @property
+        def touched(self):
+            return [entry[1] for entry in self.log if entry[0] == "touch"]
+
+        def missing(self):
+            ask(self.touched)  # to skip: before the disturbed repetition comes again
+            return None
+
+        def measure(self, design, label, seed, enough, recording, check):
+            if self.touched == [0, 1, 1]:
+                if not in_contact:
+                    raise PointDisturbed("contact: force_stale: 11 ms", "force_stale")
+                ask(self.touched)
+                check()
+            return super().measure(design, label, seed, enough, recording, check)
+
+    bench = Skipped()
+    summary, run, _ = scan(tmp_path / "run", scene(), bench, controls)
+    assert (summary.complete, summary.done, summary.skipped) == (True, 4, 0)
+    assert not wanted
+    assert bench.touched == [0, 1, 1, 2, 3]
+    assert [(r.index, r.attempt, r.outcome) for r in run.results] == [
+        (k, 0, PointOutcome.DONE) for k in range(4)
+    ]
+
+
 def test_a_reference_that_is_disturbed_comes_again(tmp_path):
     @dataclass
     class Disturbed(Bench):
