@@ -35,7 +35,7 @@ from tactile_resonance.scan.point_result import (
 )
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.recorded import last_poles
-from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.run_content import RunContent, file_of
 from tactile_resonance.scan.scene import DriftLimits, ScanScene
 from tactile_resonance.tissue.classify import TissueClass, classify
 from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
@@ -293,12 +293,14 @@ def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, s
     health, sentence = judge_drift(read_reference(run, BEFORE), read_reference(run, AFTER), limits)
     if health is not SensorHealth.STEADY:
         return health, sentence
-    first_ns, last_ns = (
-        next(of.end_ns for of in run.files if of.name.endswith(f"-{name}.mcap"))
-        for name in (BEFORE, AFTER)
+    # by the order of the files: the clock may have been set meanwhile
+    order = {file.name: place for place, file in enumerate(run.files)}
+    first, last = (
+        next(place for name, place in order.items() if name.endswith(f"-{of}.mcap"))
+        for of in (BEFORE, AFTER)
     )
-    done = [of.time_ns for of in run.latest if of.outcome is PointOutcome.DONE]
-    if outside := sum(not first_ns <= time_ns <= last_ns for time_ns in done):
+    done = [file_of(run.path, of) for of in run.latest if of.outcome is PointOutcome.DONE]
+    if outside := sum(not first < order[file.name] < last for file in done):
         which = counted(outside, "point was", "points were")
         figures = sentence.partition(": ")[2]
         return (

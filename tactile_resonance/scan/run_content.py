@@ -61,7 +61,7 @@ class RunContent:
     points : tuple of ScanPoint
         The plan; of an adaptive scan what it chose so far.
     files : tuple of FileContent
-        Finished files of the recording.
+        Finished files of the recording, in the order of the index; by the clock where one has no line there.
     results : tuple of PointResult
         Of every attempt, by point and attempt.
     problems : tuple of str
@@ -167,6 +167,10 @@ def read_run(path: Path) -> RunContent:
             unchecked += not checked
             if result is not None:
                 results.append(result)
+    place = {Path(name).name: line for line, name in enumerate(entries)}
+    if not all(file.name in place for file in files):
+        place = {file.name: file.start_ns for file in files}
+    files.sort(key=lambda file: place[file.name])
     return replace(
         run,
         files=tuple(files),

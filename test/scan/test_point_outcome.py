@@ -90,14 +90,22 @@ def test_drift_is_a_change_beyond_uncertainty_and_limit(after, health):
     assert ("warning" in sentence) == (health is SensorHealth.DRIFTED)
 
 
-@pytest.mark.parametrize(("times_s", "outside"), [((5, 6), 0), ((1, 6), 1), ((5, 9), 1), ((1, 9), 2)])
-def test_references_vouch_for_the_points_between_them(monkeypatch, times_s, outside):
-    """One that failed, or was damaged, is taken as the run is resumed."""
+@pytest.mark.parametrize(("measured", "outside"), [("B01A", 0), ("0B1A", 1), ("B0A1", 1), ("0BA1", 2)])
+def test_references_vouch_for_the_points_between_them(monkeypatch, measured, outside):
+    """One that failed, or was damaged, is taken as the run is resumed; the clock may be set meanwhile."""
     monkeypatch.setattr(point_outcome, "read_reference", lambda run, name: reference())
-    names = {"reference-00-air-before.mcap": 3, "reference-01-air-after.mcap": 8}
+    names = {
+        **{"B": "reference-00-air-before.mcap", "A": "reference-01-air-after.mcap"},
+        **{"0": "point-00000-00.mcap", "1": "point-00001-00.mcap"},
+    }
+    ends_ns = (7, 8, 2, 3)
     run = SimpleNamespace(
-        files=[SimpleNamespace(name=name, end_ns=seconds * 10**9) for name, seconds in names.items()],
-        latest=[PointResult(k, time_ns=seconds * 10**9) for k, seconds in enumerate(times_s)]
+        path=".",
+        files=[
+            SimpleNamespace(name=names[of], end_ns=end_ns)
+            for of, end_ns in zip(measured, ends_ns, strict=True)
+        ],
+        latest=[PointResult(k, time_ns=ends_ns[measured.index(f"{k}")]) for k in range(2)]
         + [PointResult(2, outcome=PointOutcome.SKIPPED, time_ns=1)],
     )
     health, sentence = sensor_health(run, LIMITS)

@@ -271,7 +271,7 @@ def test_repeat_between_points_makes_a_second_attempt(tmp_path):
     assert [(r.index, r.attempt) for r in content.results] == [(0, 0), (1, 0), (1, 1)]
 
 
-def test_a_clock_that_is_set_back_changes_neither_the_last_point_nor_the_latest_attempt(
+def test_a_clock_that_is_set_back_changes_neither_last_point_nor_latest_attempt_nor_order(
     tmp_path, monkeypatch
 ):
     controls, set_s, time_ns = Controls(), [0.0], time.time_ns
@@ -287,8 +287,11 @@ def test_a_clock_that_is_set_back_changes_neither_the_last_point_nor_the_latest_
             return None
 
     bench = Repeated()
-    scan(tmp_path / "set", scene(4), bench, controls)
+    _, run, _ = scan(tmp_path / "set", scene(4), bench, controls)
     assert [entry[1] for entry in bench.log if entry[0] == "touch"] == [0, 1, 2, 2, 3]
+    names = ["reference-00-air-before", "point-00000-00", "point-00001-00", "point-00002-00"]
+    names += ["point-00002-01", "point-00003-00", "reference-01-air-after"]
+    assert [file.name for file in run.files] == [f"{name}.mcap" for name in names]
     set_s[0] = 0.0
     scan(tmp_path / "run", scene(2), Bench())
     set_s[0] = -3600.0
