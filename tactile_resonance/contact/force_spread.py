@@ -293,9 +293,14 @@ class ForceRecord:
         """Why the force of an interval is not known; empty where it is."""
         if t1_ns > now_ns:
             return f"the block ends {(t1_ns - now_ns) * 1e-6:.1f} ms in the future"
-        if t0_ns < max(now_ns - self._length_ns, oldest_ns):
+        kept_ns = now_ns - self._length_ns
+        if t0_ns < max(kept_ns, oldest_ns):
             ago_s, length_s = (now_ns - t0_ns) * 1e-9, self._length_ns * 1e-9
-            return f"the block begins {ago_s:.1f} s ago, forces are kept for {length_s:g} s"
+            text = f"the block begins {ago_s:.1f} s ago, forces are kept for "
+            if t0_ns >= kept_ns:
+                length_s = (now_ns - oldest_ns) * 1e-9
+                return f"{text}{length_s:.1f} s, since they come faster than the rate_hz of their source"
+            return f"{text}{length_s:g} s"
         if coverage < LEAST_COVERAGE:
             accepted = f"at least {100 * LEAST_COVERAGE:g} % are accepted"
             return f"forces cover {100 * coverage:.3g} % of the block, {accepted}"
