@@ -257,8 +257,13 @@ def _pass_mock(plan: _Decisions, robot: str, priority: bool) -> bool:
     )
     pass_on("fake_hardware_node", "", scene=SCENE)
     table = value("scan_node", "table_in_base") or value("fake_hardware_node", "table_in_base")
+    at = TABLE_IN_BASE
+    if robot == "false":
+        at = [0.0] * 6
+        accepted = "zeros: with robot:=false the bench takes tcp_pose to be in the frame of the scene"
+        require(not table or not any(_table(table)), "table_in_base", table, accepted)
     for node in ("scan_node", "fake_hardware_node"):
-        pass_on(node, "table_in_base", table_in_base=_table(table or TABLE_IN_BASE))
+        pass_on(node, "table_in_base", table_in_base=_table(table or at))
     if value("contact_node", "force_config") in (None, SIMULATED_CELL):
         pass_on("contact_node", "", force_host=host)
     clock = plan.stated["fake_hardware_node"].get("use_sim_time", True)

@@ -210,6 +210,19 @@ def test_what_brings_the_tip_decides_which_nodes_there_are(
         assert nodes["fake_hardware_node"]["serve_contact"] == (not robot and contact == "robot")
 
 
+def test_without_robot_a_scan_tells_the_bench_places_of_its_scene():
+    """There `tcp_pose` of the scan, in the base, is taken to be in the frame of the scene."""
+    _, nodes = heard(MOCK | {"robot": "false"})
+    for node in ("scan_node", "fake_hardware_node", "pole_map_node"):
+        assert nodes[node]["table_in_base"] == [0.0] * 6
+    for arguments, file in (
+        ({"table_in_base": "[0.1, 0, 0, 0, 0, 0]"}, {}),
+        ({}, {"/scan_node": {"table_in_base": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}),
+    ):
+        with pytest.raises(ValueError, match="table_in_base: .*0.1.* zeros: with robot:=false"):
+            heard(MOCK | {"robot": "false"} | arguments, file)
+
+
 def test_nodes_with_a_robot_are_told_nothing_that_is_simulated():
     plan, nodes = heard(REAL | {"robot_ip": "192.0.2.1"})
     assert not plan.simulated_time
