@@ -231,6 +231,7 @@ class SimulatedTip:
         table, self.frame_id = values(node, "table_in_base", "frame_id")
         self._laid = LaidScene(scene, pose_of(table, "table_in_base"))
         self.tip, self.stays, self.stalls = BenchTip(None, 0.0, 1.0), Stays(), 0
+        self._in_scene = False  # whether `tcp_pose` is in the frame of the scene, and not in the base
         self.truths = node.publish_on(msg.Poles, "bench/truth", TRUTHS)
         if plant is not None:
             node.every(PLANT_CHECK_S, self._check_plant)
@@ -238,7 +239,8 @@ class SimulatedTip:
             node.serve(ForceOver, "force_over", self.stays.serve)
 
     def follow_poses(self) -> None:
-        """Be where `tcp_pose` states, and publish the force there on `wrench`."""
+        """Be where `tcp_pose` states, in the frame of the scene, and publish the force there on `wrench`."""
+        self._in_scene = True
         self._wrench = self._node.publish_on(WrenchStamped, "wrench", STREAM)
         # a scan waits until the pose is received, which needs a reliable subscription; others publish
         self._node.listen(PoseStamped, "tcp_pose", self._on_pose, PLACES)
@@ -250,8 +252,10 @@ class SimulatedTip:
         return vector(table.position_m + table.rotation.apply([0.0, 0.0, height_m]))
 
     def at(self, place_m: tuple[float, float, float]) -> BenchTip:
-        """A tip at a place of the scene, at the scene's force."""
-        return BenchTip(self._scene.tissue_at(place_m), self._scene.force_n, 1.0)
+        """A tip at a place in the frame of `tcp_pose` [m], at the scene's force."""
+        scene, place = self._scene, np.array(place_m)
+        tissue = scene.tissue_at(place) if self._in_scene else self._laid.tissue_at(place)
+        return BenchTip(tissue, scene.force_n, 1.0)
 
     def take_up(self) -> None:
         """With a robot: the contact as it is now, and its truth; raises ValueError."""

@@ -22,7 +22,7 @@ from spinning import spin_until
 from std_srvs.srv import SetBool, Trigger
 from tactile_resonance.action import MakeContact
 from tactile_resonance.msg import ContactState
-from tactile_resonance.srv import ForceOver
+from tactile_resonance.srv import ForceOver, Truth
 
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.nodes import ideal_contact, managed_node
@@ -130,6 +130,7 @@ def bench(**parameters):
         retract = node.create_client(Trigger, "retract")
         stop = node.create_client(SetBool, "stop")
         force = node.create_client(ForceOver, "force_over")
+        truth = node.create_client(Truth, "bench/get_truth")
 
         def wait(holds):
             assert spin_until(executor, holds)
@@ -152,10 +153,12 @@ def bench(**parameters):
             return answer(force.call_async(request))
 
         wait(lambda: contact.server_is_ready() and retract.service_is_ready())
+        wait(truth.service_is_ready)
         wait(lambda: force.service_is_ready() and stop.service_is_ready() and states and wrenches)
         made = SimpleNamespace(node=node, make=make, answer=answer, wait=wait, state=state)
         made.stop = lambda on: answer(stop.call_async(SetBool.Request(data=on)))
         made.retract = lambda: answer(retract.call_async(Trigger.Request()))
+        made.truth = lambda **asked: answer(truth.call_async(Truth.Request(**asked)))
         made.contact, made.force_over = contact, force_over
         made.states, made.poses, made.wrenches = states, poses, wrenches
         yield made
@@ -205,6 +208,9 @@ def test_a_contact_is_made_held_told_and_drawn_back(ideal):
         "base"
     }  # none before the tip is placed
     assert ideal.states[-1].force_n == FORCE_N
+    # what the bench knows of a place is asked for in the frame of tcp_pose too
+    told = ideal.truth(here=True), ideal.truth(position=goal_at().pose.pose.position)
+    assert [(each.tissue, list(each.f0_hz)) for each in told] == [("gel10", told[0].f0_hz.tolist())] * 2
     now_ns = time.time_ns()
     assert ideal.force_over(made_ns, now_ns).force_n == FORCE_N
     assert ideal.force_over(before_ns - SECOND_NS, before_ns).force_n == 0.0
