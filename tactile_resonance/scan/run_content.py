@@ -103,11 +103,10 @@ class RunContent:
         reference : str
             Those of a reference of this name; empty: all.
         """
-        files = sorted(self.files, key=lambda file: (file.start_ns, file.name))
         ending = f"-{reference}.mcap" if reference else ""
         return [
             self.path / RECORDING / file.name
-            for file in files
+            for file in self.files
             if file.name.endswith(ending) and (not type_name or file.messages(type_name))
         ]
 

@@ -87,16 +87,6 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded") / "run"
     plan = [ScanPoint(i, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)) for i in range(2)]
     with RunDirectory.create(folder, "name: x\n", plan, {}) as run:
-        for index, key in enumerate((11, 12)):
-            excitation, records = measurement(key)
-            with run.begin_point(index) as recording:
-                cdr = serialize_message(excitation_to_message(excitation, START_NS, "tip"))
-                recording.write("/left/excitation", EXCITATION, START_NS, cdr)
-                for k, record in enumerate(records):
-                    cdr = serialize_message(record_to_message(record))
-                    recording.write("/left/record", RECORD, START_NS + k, cdr)
-                result = PointResult(index, measurement_id=key, time_ns=START_NS + 10 * (index + 1))
-                recording.finish(result)
         # free air, taken before the points
         excitation, records = measurement(13)
         with run.begin_reference("air-before") as recording:
@@ -108,6 +98,16 @@ def run(tmp_path_factory):
                     "/left/record", RECORD, time_ns, serialize_message(record_to_message(record))
                 )
             recording.finish(PointResult(2, kind=PointKind.AIR, measurement_id=13))
+        for index, key in enumerate((11, 12)):
+            excitation, records = measurement(key)
+            with run.begin_point(index) as recording:
+                cdr = serialize_message(excitation_to_message(excitation, START_NS, "tip"))
+                recording.write("/left/excitation", EXCITATION, START_NS, cdr)
+                for k, record in enumerate(records):
+                    cdr = serialize_message(record_to_message(record))
+                    recording.write("/left/record", RECORD, START_NS + k, cdr)
+                result = PointResult(index, measurement_id=key, time_ns=START_NS + 10 * (index + 1))
+                recording.finish(result)
     return folder
 
 

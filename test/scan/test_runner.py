@@ -292,6 +292,7 @@ def test_a_clock_that_is_set_back_changes_neither_last_point_nor_latest_attempt_
     names = ["reference-00-air-before", "point-00000-00", "point-00001-00", "point-00002-00"]
     names += ["point-00002-01", "point-00003-00", "reference-01-air-after"]
     assert [file.name for file in run.files] == [f"{name}.mcap" for name in names]
+    assert [path.stem for path in run.paths()] == names  # and so a replay plays them
     set_s[0] = 0.0
     scan(tmp_path / "run", scene(2), Bench())
     set_s[0] = -3600.0
