@@ -98,6 +98,21 @@ def test_what_is_out_of_range_is_refused_with_a_reason(ros, node, name, value):
         made.destroy_node()
 
 
+def test_a_name_that_is_misspelt_is_told(monkeypatch):
+    """ROS passes over it without a word, and the default would hold."""
+    given = ["-p", "levl_v:=0.1", "-p", "level_v:=0.2", "-p", "use_sim_time:=false"]
+    with initialised(args=["--ros-args", *given], domain_id=free_domain_id(os.environ)):
+        node, told = excitation_node.ExcitationNode(), []
+        monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=told.append))
+        monkeypatch.setattr(node, "configure", lambda: None)
+        try:
+            node.trigger_configure()
+        finally:
+            node.destroy_node()
+    text = "parameters that excitation_node does not have are given, and ignored: levl_v"
+    assert told == [text]
+
+
 def test_compressed_phases_for_one_realisation_only(ros):
     from tactile_resonance.action import Measure
 
