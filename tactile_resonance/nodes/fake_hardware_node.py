@@ -216,7 +216,7 @@ class FakeHardwareNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("fake_hardware_node", PARAMETERS)
         self._playing: Playing | None = None
-        self._played: tuple[int, Play.Response] | None = None  # what is played, and the answer
+        self._played: tuple[msg.Excitation, Play.Response] | None = None  # and the answer
         self._touch: SimulatedTip | None = None
         (serves_contact,) = values(self, "serve_contact")
         self._stop = StopInput(self) if serves_contact else None
@@ -268,10 +268,10 @@ class FakeHardwareNode(ManagedNode):
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
         try:
             self.require_active()
-            asked_id = request.excitation.excitation_id
-            if self._played is not None and self._played[0] == asked_id != 0:
+            asked = request.excitation
+            if asked.excitation_id and self._played is not None and self._played[0] == asked:
                 return self._played[1]  # asked again: the answer was lost, or late
-            excitation = excitation_from_message(request.excitation)
+            excitation = excitation_from_message(asked)
             effects = BenchEffects(**dict(zip(EFFECTS, values(self, *EFFECTS), strict=True)))
             (seed,) = values(self, "seed")
             # noise repeats with the excitation's own seed, whatever was played before
@@ -294,7 +294,7 @@ class FakeHardwareNode(ManagedNode):
             return response
         self._say_effort(run, excitation)
         response.accepted, response.start = True, time_message(start_ns)
-        self._played = excitation.excitation_id, response
+        self._played = asked, response
         return response
 
     def _say_effort(self, run: BenchRun, excitation: Excitation) -> None:

@@ -32,8 +32,8 @@ def bench():
         blocks = []
         node.create_subscription(msg.Record, "bench/block", blocks.append, RESULTS)
 
-        def ask(excitation_id):
-            excitation = design_multisine(periods=PERIODS, excitation_id=excitation_id)
+        def ask(excitation_id, **changed):
+            excitation = design_multisine(periods=PERIODS, excitation_id=excitation_id, **changed)
             message = excitation_to_message(excitation, 0, "tip")
             return node._on_play(Play.Request(excitation=message), Play.Response())
 
@@ -67,6 +67,14 @@ def test_another_one_or_one_after_a_stop_begins_anew(bench):
     again = ask(8)
     assert again.start != other.start
     assert all_of(8)[-PERIODS:] == list(range(PERIODS))
+
+
+def test_another_excitation_of_the_same_id_is_played(bench):
+    ask, all_of, _ = bench
+    first, second = ask(7), ask(7, level_v=0.5)
+    assert second.accepted
+    assert second.start != first.start
+    assert all_of(7)[-PERIODS:] == list(range(PERIODS))
 
 
 def test_excitations_without_an_id_are_never_the_same(bench):
