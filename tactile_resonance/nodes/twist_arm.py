@@ -358,7 +358,8 @@ class TwistArm:
         if stamp_ns == 0 or (early_s > EARLIEST_S and not self.clock.simulated):
             text = f"the time stamp of a pose on {topic} is {early_s:.3g} s ahead, accepted are "
             return f"{text}{EARLIEST_S:g} s, and not 0"
-        if self._tools and time_ns <= self._tools[-1].time_ns:
+        tools = self._tools  # `connect` exchanges them, in another thread
+        if tools and time_ns <= tools[-1].time_ns:
             return f"time stamps of poses on {topic} do not increase"
         place, turn = message.pose.position, message.pose.orientation
         if not all(map(math.isfinite, (place.x, place.y, place.z))):

@@ -4,6 +4,7 @@
 import math
 import os
 import time
+from collections import deque
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -305,6 +306,21 @@ def test_a_controller_that_listens_no_more_is_a_fault(make):
     controller.pose()
     assert fault_of(lambda: controller.arm.speed(DOWN, HARD_M_S2)) is ArmFault.LINK_LOST
     assert fault_of(controller.arm.state) is ArmFault.LINK_LOST
+
+
+def test_a_pose_that_comes_as_the_fault_is_forgotten_is_taken(make):
+    """An error in the thread that listens would end it: no further pose would ever be heard."""
+    controller = make()
+    controller.period()
+
+    class Exchanged(deque):
+        def __bool__(self):
+            controller.arm.connect()
+            return super().__len__() > 0
+
+    controller.arm._tools = Exchanged(controller.arm._tools)
+    controller.period()
+    assert len(controller.arm._tools) == 1
 
 
 @pytest.mark.parametrize("speed_m_s", [0.004, 0.05])
