@@ -64,7 +64,7 @@ class OneGoal:
         self._node, self._around = node, around
         self.handle: ServerGoalHandle | None = None
         self.controls: Controls | None = None
-        self._asked = self._rejection = ""
+        self._asked = self._rejection = self._action = ""
         node.serve(Trigger, "scan/rejection", self._on_rejection)
 
     def act(
@@ -115,7 +115,7 @@ class OneGoal:
             if self.handle is not None:
                 goal.abort()
                 return busy
-            self.handle, self.controls = goal, Controls()
+            self.handle, self.controls, self._action = goal, Controls(), name
             if goal.is_cancel_requested or not self._node.active:  # before there were controls
                 self.cancel()
             try:
@@ -129,11 +129,12 @@ class OneGoal:
         self._node.act(kind, name, serve, lambda _: self.cancel(), refuses)
 
     def serve_control(self, name: str, ask: Callable[[Controls], None]) -> None:
-        """Service that asks something of the goal that is worked at."""
+        """Service ``ACTION/...`` that asks something of the goal of that action, where one is worked at."""
+        action = name.partition("/")[0]
 
         def do() -> str:
-            if self.controls is None:
-                raise ValueError("no scan is running")
+            if self.controls is None or self._action != action:
+                raise ValueError(f"no {action} is running")
             ask(self.controls)
             return ""
 

@@ -21,6 +21,9 @@ class Node:
     def serve(self, *_):
         pass
 
+    def serve_trigger(self, name, do):
+        self.control = do
+
     def act(self, kind, name, serve, on_cancel, refuses):
         self.goal, self.refuses = serve, refuses
 
@@ -52,3 +55,36 @@ def test_a_goal_accepted_as_the_node_is_deactivated_is_cancelled_at_once(monkeyp
     node.active = active
     asyncio.run(node.goal(SimpleNamespace(request=request, is_cancel_requested=False)))
     assert cancelled == [not active]
+
+
+def test_what_is_asked_of_a_scan_is_refused_while_a_table_is_calibrated(monkeypatch):
+    """It would be answered that it is done, and the arm would go on."""
+
+    async def here(node, work, name):
+        return work()
+
+    monkeypatch.setattr(scan_actions, "in_thread", here)
+    monkeypatch.setattr(scan_actions, "end_goal", lambda goal, done: None)
+    node = Node(active=True)
+    goals = scan_actions.OneGoal(node, contextlib.nullcontext)
+    goals.serve_control("scan/pause", lambda controls: controls.paused.set())
+
+    def work(goal, checked):
+        if goal.request.action == "scan":
+            node.control()
+        else:
+            with pytest.raises(ValueError, match="no scan is running"):
+                node.control()
+        paused.append(goals.controls.paused.is_set())
+        return SimpleNamespace(outcome=0)
+
+    async def check(message):
+        return "checked"
+
+    paused = []
+    for action in ("scan", "calibrate_table"):
+        goals.act(object, action, check, work, 0, None)
+        request = SimpleNamespace(action=action)
+        assert not asyncio.run(node.refuses(request))
+        asyncio.run(node.goal(SimpleNamespace(request=request, is_cancel_requested=False)))
+    assert paused == [True, False]
