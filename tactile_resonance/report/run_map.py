@@ -53,7 +53,7 @@ from tactile_resonance.scan.pole_map import (
     PoleMap,
     counts,
 )
-from tactile_resonance.scan.run_content import RunContent
+from tactile_resonance.scan.run_content import RunContent, file_of
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -309,7 +309,11 @@ def write_map_recording(run: RunContent) -> Path | None:
     OSError
         If it cannot be written.
     """
-    results = sorted(filter(counts, run.results), key=lambda result: result.time_ns)
+    # as they were finished, whatever the clock showed: of two attempts at a point the later one counts
+    place = {file.name: number for number, file in enumerate(run.files)}
+    results = sorted(
+        filter(counts, run.results), key=lambda result: place[file_of(run.path, result).name]
+    )
     if not results:
         return None
     with TemporaryDirectory(dir=run.path, prefix=".map-") as hidden:
@@ -322,13 +326,14 @@ def write_map_recording(run: RunContent) -> Path | None:
         if scene is not None:  # by number as pole_map_node has them, whichever were called
             names = tuple(tissue.name for tissue in scene.tissue_classes)
         adaptive = None if scene is None else scene.adaptive
-        grown, latest = GrowingMap(), {}
+        grown, latest, now_ns = GrowingMap(), {}, 0
         for done, result in enumerate(results, start=1):
             grown.take(result)
             latest[result.index] = result
+            now_ns = max(now_ns, result.time_ns)  # a clock that was set back would play them in another order
             if (len(results) - done) % step:  # the last one is drawn
                 continue
-            shown, header, beside = grown.map, header_message(frame_id, result.time_ns), []
+            shown, header, beside = grown.map, header_message(frame_id, now_ns), []
             if adaptive is not None:
                 beside = boundary_markers(shown, adaptive.boundary(latest.values()), header)
             scale = shown.ellipse_scale(_NODE_PROBABILITY)
@@ -337,10 +342,9 @@ def write_map_recording(run: RunContent) -> Path | None:
                 "/markers": marker_message(shown, scale, _NODE_PROBABILITY, header, beside),
                 "/legend": legend_message(shown, scale, _NODE_PROBABILITY, names, header),
             }.items():
-                _write(writer, f"/pole_map{name}", result.time_ns, message, _LATCHED)
-        ended_ns = results[-1].time_ns
-        surface = surface_message(last, _NODE_CELLS, header_message(frame_id, ended_ns))
-        _write(writer, "/pole_map/surface", ended_ns, surface, _LATCHED)
+                _write(writer, f"/pole_map{name}", now_ns, message, _LATCHED)
+        surface = surface_message(last, _NODE_CELLS, header_message(frame_id, now_ns))
+        _write(writer, "/pole_map/surface", now_ns, surface, _LATCHED)
         writer.finish()
         os.replace(Path(hidden) / RECORDING, run.path / RECORDING)
     return run.path / RECORDING

@@ -104,6 +104,19 @@ def test_the_map_grows_with_the_tissue_that_counts(folder):
     assert "simulated, not measured" in texts
 
 
+def test_of_two_attempts_the_later_one_counts_whatever_the_clock_showed(tmp_path):
+    plan = [ScanPoint(i, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)) for i in range(2)]
+    with RunDirectory.create(tmp_path / "run", "name: x\n", plan, {}) as run:
+        for attempt, index in ((0, 0), (0, 1), (1, 1)):
+            result = result_of(index, attempt, f0_hz=250.0 + index + 2 * attempt)
+            set_back_ns = attempt * 3600 * 10**9
+            with run.begin_point(index) as recording:
+                recording.finish(replace(result, time_ns=result.time_ns - set_back_ns))
+    clouds = told(write_map_recording(read_run(tmp_path / "run")), "/pole_map")
+    shown = [np.frombuffer(cloud.data.tobytes(), POINT)["f0_hz"].tolist() for _, cloud in clouds]
+    assert [sorted(f0) for f0 in shown] == [[250.0], [250.0, 251.0], [250.0, 253.0]]
+
+
 def test_its_frames_are_those_of_the_scan(folder):
     path = write_map_recording(read_run(folder))
     ((_, static),) = told(path, "/tf_static")
