@@ -74,10 +74,7 @@ def read_phantoms(path: Path) -> PhantomScene | None:
 
 def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
     """Precision and blocks at the first point of each tissue, as the simulated bench measures them."""
-    from tactile_resonance.poles.result import PolesStatus
     from tactile_resonance.scan.decision import Verdict
-
-    sure = PolesStatus.OK, PolesStatus.NO_COVARIANCE
 
     if phantoms is None:
         return [
@@ -95,14 +92,7 @@ def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
             continue
         poles, decision = _rehearsed(plan, tissue)
         blocks[tissue.name] = decision.blocks
-        found = ", ".join(
-            f"f0 {of.main.f0_hz:.2f} +- {of.main.std[0]:.2g} Hz, damping ratio "
-            f"{of.main.damping_ratio:.5f} +- {of.main.std[1]:.1g}"
-            + ("" if of.status in sure else f", {of.status.value}")
-            if of.main.found
-            else f"no pole from {of.band_hz[0]:g} to {of.band_hz[1]:g} Hz: {of.status.value}"
-            for of in poles.bands
-        )
+        found = ", ".join(map(_found, poles.bands))
         ended = "" if decision.verdict is Verdict.PRECISE else f"; {decision.verdict.value}"
         after = counted(decision.blocks, "block")
         lines.append(f"on {tissue.name} (simulated), {HELD_S:g} s old, after {after}: {found}{ended}")
@@ -111,6 +101,20 @@ def _expected(phantoms: PhantomScene | None, plan: Plan) -> list[str]:
         at_most = "at most " if plan.scene.adaptive else ""
         lines.append(f"time {at_most}{plan.duration_s(mean) + plan.search_s:.0f} s")
     return lines or ["precision unknown: no point lies on a region of the scene"]
+
+
+def _found(poles: Poles) -> str:
+    """The main mode of a band, and what speaks against it."""
+    from tactile_resonance.poles.result import PolesStatus
+
+    mode, status = poles.main, poles.status
+    if status is PolesStatus.FAILED:
+        return f"no poles: {poles.message}"
+    if not mode.found:
+        return f"no pole from {poles.band_hz[0]:g} to {poles.band_hz[1]:g} Hz: {status.value}"
+    remark = "" if status in (PolesStatus.OK, PolesStatus.NO_COVARIANCE) else f", {status.value}"
+    f0, damping = f"{mode.f0_hz:.2f} +- {mode.std[0]:.2g} Hz", f"{mode.damping_ratio:.5f} +- {mode.std[1]:.1g}"
+    return f"f0 {f0}, damping ratio {damping}{remark}"
 
 
 def _rehearsed(plan: Plan, tissue: Tissue) -> tuple[Poles, Decision]:

@@ -131,12 +131,16 @@ def test_the_command_compiles_the_packages_own_scenes(capsys, tmp_path):
     [
         ("sensor: {order: 0, band_high_hz: 620, samples_per_period: auto}", ", 1 s old, after 3 blocks: f0 25"),
         (
+            "sensor: {order: 0, band_high_hz: 620}\nblocks: {least: 1, most: 1}",
+            ", 1 s old, after 1 block: no poles: ",
+        ),
+        (
             "sensor: {calibrated: true, band_high_hz: 400, samples_per_period: auto}",
             "precision unknown: it follows from the calibration, which the scene does not name",
         ),
         ("normals: {}", "time 10 s"),
     ],
-    ids=["one block has no order", "calibrated", "touches for normals"],
+    ids=["one block has no order", "nor has the only one", "calibrated", "touches for normals"],
 )
 def test_what_a_plan_expects(more, expected, tmp_path, capsys):
     path = tmp_path / "scene.yaml"
