@@ -121,10 +121,9 @@ def _read(path: Path, options: argparse.Namespace) -> IndentationRecord:
     time_s, force_n, indentation_m = (arrays[name].ravel().astype(float) for name in COLUMNS)
     ball = BallTip(options.radius_m, options.poisson_ratio, stiffness)
     try:
+        protocol = Protocol(options.protocol)
         return IndentationRecord(
-            *(Protocol(options.protocol), time_s, force_n, indentation_m, ball),
-            label=path.name,
-            source=path.name,
+            protocol, time_s, force_n, indentation_m, ball, label=path.name, source=path.name
         )
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from error

@@ -199,11 +199,12 @@ def assemble(
         for name in ("poles_rad_s", "f0_hz", "damping_ratio", "residues"):
             quantities[name][undetermined] = np.nan
     poles = quantities["poles_rad_s"]
-    tested, dof = covariance, np.full(judged.lines.shape, np.inf)
+    tested, dof = covariance, np.array(np.inf)
     if judged.total is not None and not judged.level_known.all():
         of_residuals = ~judged.level_known & ~hopeless
         tested = np.where(of_residuals[:, None, None], judged.total, covariance)
-        dof[of_residuals] = np.maximum(judged.lines - tested.shape[-1] / 2, 1)[of_residuals]
+        free = np.maximum(judged.lines - tested.shape[-1] / 2, 1)
+        dof = np.where(of_residuals, free, np.inf)
     significant, distance = significant_modes(model, quantities, tested, judged.lines, dof)
     significant &= ~judged.dispensable
     in_doubt = [k for k, matrix in enumerate(judged.doubt) if matrix is not None]

@@ -241,7 +241,7 @@ def lines_of_spectra(
     known = replace(known, kind=np.where(varies, 2, known.kind))
     together = known.kind[:, None] < 2
     correlation /= np.maximum(known.lines[:, None], np.abs(correlation))  # 1 at most
-    sample = c_yy, c_uu, c_yu
+    sample = {"variance_y": c_yy, "variance_u": c_uu, "covariance_yu": c_yu}
     c_yu = np.where(together, correlation * both, c_yu)
     c_yy, c_uu = (np.where(together, *pair) for pair in ((smooth_y, c_yy), (smooth_u, c_uu)))
     power_y, power_u = (_power(x, usable) for x in (z[:, 0], z[:, 1]))
@@ -255,8 +255,7 @@ def lines_of_spectra(
         variance_u=c_uu,
         covariance_yu=c_yu,
     )
-    names = ("variance_y", "variance_u", "covariance_yu")
-    return WeightedLines(data, known, level_known, data.weighted(**dict(zip(names, sample, strict=True))))
+    return WeightedLines(data, known, level_known, data.weighted(**sample))
 
 
 def _channel(variance: FloatArray, usable: BoolArray, dof: int, pooled: bool) -> VarianceModel:

@@ -200,8 +200,11 @@ def significant_modes(
             for near in _neighbours(poles[row], there[row]):
                 # nearer than their widths: neither is certain alone, both together are
                 found[row, near] = _significant_together(
-                    *(residues[row, near], sensitivity[k, near], coefficients[row]),
-                    *(int(lines[row]), float(dof[row])),
+                    residues[row, near],
+                    sensitivity[k, near],
+                    coefficients[row],
+                    int(lines[row]),
+                    float(dof[row]),
                 )
     return found, distances
 

@@ -199,7 +199,7 @@ class Adaptive:
     ) -> FloatArray:
         """(f,) loss that a touch at each free place is expected to take away, summed over the region.
 
-        By the likeliest length and size alone: to choose, that does, and costs a tenth.
+        By the likeliest process alone: to choose, that does, and costs a tenth.
         """
         process = surface.likeliest
         coarse = self._raster(CELLS // 2)

@@ -5,8 +5,8 @@ Ordinary kriging: an unknown constant mean, a Matern covariance of smoothness 5/
 place, independent at any two, that is part of the quantity and not of the noise (nugget effect: Chiles and
 Delfiner, Geostatistics, 2012). Length, size and scatter are those of greatest restricted likelihood (Rasmussen
 and Williams, Gaussian Processes for Machine Learning, 2006, chapters 2, 4 and 5). Few points determine these
-badly: there what is known is a mixture over those that they allow, each with its likelihood, no logarithm of
-either preferred beforehand (Handcock and Stein, Technometrics 35, 1993).
+badly: there what is known is a mixture over those that they allow, each with its likelihood; no logarithm of
+length, size or scatter is preferred beforehand (Handcock and Stein, Technometrics 35, 1993).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Process(NamedTuple):
     def of(
         cls, xy_m: FloatArray, y: FloatArray, noise: FloatArray, length_m: float, std: float, scatter: float
     ) -> Process:
-        """Of values (n,) with noise."""
+        """Of values (n,) with noise (n,)."""
         covariance = std**2 * _matern(cdist(xy_m, xy_m) / length_m)
         alone = noise**2 + scatter**2 + _JITTER * std**2
         lower = np.asarray(cholesky(covariance + np.diag(alone), lower=True), np.float64)
@@ -314,7 +314,7 @@ def _fitted(
     """
     parts = [(cdist(xy[own], xy[own]), y[own], noise[own]) for own in _parts(xy)]
     scale = _scale(y)
-    size = min(max(np.log(scale), sizes[0]), sizes[1])
+    size = np.clip(np.log(scale), *sizes)
     # where a value is exact there is none; else between what noise hides and the whole
     hidden = max(0.01 * float(np.median(noise)), 1e-6 * scale)
     most = max(scale, hidden) if noise.all() else hidden

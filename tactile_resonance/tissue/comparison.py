@@ -69,7 +69,7 @@ def differences_from_rest(
     Raises
     ------
     ValueError
-        If a shape does not fit, or something is not finite.
+        If a shape does not fit, something is not finite, or a covariance is not positive definite.
 
     Notes
     -----
@@ -215,7 +215,7 @@ def find_clusters(
     Raises
     ------
     ValueError
-        If a shape does not fit, or something is not finite.
+        If a shape does not fit, something is not finite, or a covariance is not positive definite.
     """
     given = np.zeros((2, 2)) if spread is None else spread
     x, noise, own = _checked(estimates, covariances, given)
