@@ -246,7 +246,7 @@ def run_job(job: Job) -> int:
         way_on = "" if job.resume and isinstance(error, ScanRefused) else _way_on(job)
         raise ValueError(f"{error} (logs in {work / 'log'}){way_on}") from error
     except OSError as error:  # the terminal was closed, which may be seen before SIGHUP comes
-        raise OSError(error.errno, f"{error.strerror}{_way_on(job)}", error.filename) from error
+        raise OSError(error.errno, f"{error.strerror or error}{_way_on(job)}", error.filename) from error
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(_way_on(job)) from error
     if result.ending is Ending.COMPLETE:  # each simulated record that counts is in the run

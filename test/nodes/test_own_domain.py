@@ -53,13 +53,18 @@ def test_a_domain_with_nodes_of_another_session_is_refused(
         node.destroy_node()
 
 
-def test_a_terminal_that_was_closed_is_told_how_to_go_on_where_a_run_was_begun(monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    "error",
+    [OSError(errno.EIO, "Input/output error"), FileNotFoundError("no such error")],
+    ids=["of a line to the terminal", "without a number"],
+)
+def test_a_terminal_that_was_closed_is_told_how_to_go_on_where_a_run_was_begun(monkeypatch, tmp_path, error):
     run = tmp_path / "run"
 
     def scan(*_):
         run.mkdir()
         (run / "run.json").touch()
-        raise OSError(errno.EIO, "Input/output error")  # of a line to the terminal
+        raise error
 
     nodes = SimpleNamespace(bring_up=lambda *_, **__: None)
     monkeypatch.setattr(bench_scan, "NodeProcesses", lambda _: contextlib.nullcontext(nodes))
