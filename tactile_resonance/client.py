@@ -134,7 +134,7 @@ class AskedGoal:
     heard: Any = None  # the newest feedback
 
     def lost(self, why: str = "scan_node went away") -> Any:
-        """Outcome where the server went away, or does not know."""
+        """Outcome where the result is not known."""
         run = getattr(self.heard, "run_directory", "")
         if not run:
             return self.kind(Ending.LOST, why)

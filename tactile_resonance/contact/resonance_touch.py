@@ -86,11 +86,11 @@ class PolesTouch:
 
 
 def _per_scatter(probability: float, blocks: int) -> float:
-    """How often the summed squares of the blocks about their mean one more is beyond with this probability.
+    """Ratio that the statistic of one more block has to the scatter of the blocks with this probability.
 
-    Where the scatter is that of the covariances times a factor, the ratio of both, over their degrees of
-    freedom 2 and 2 (n - 1), follows F; where it is all in one direction, 1 and n - 1. What is between is
-    beyond more rarely than in one of these.
+    Scatter: their summed squares about their mean. Where it is that of the covariances times a factor, the
+    ratio follows F, with 2 and 2 (n - 1) degrees of freedom; where it is all in one direction, with 1 and
+    n - 1. Of any other scatter the ratio is beyond the larger of both more rarely.
     """
     spare = blocks - 1
     if not spare:

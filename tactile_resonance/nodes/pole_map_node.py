@@ -135,7 +135,7 @@ class PoleMapNode(ManagedNode):
 
     # diagnostics ask for them from the beginning
     _grown = GrowingMap()
-    _unplaced = GrowingMap()  # points that failed before they had poles: where the tip was nobody knows
+    _unplaced = GrowingMap()  # points that failed before they had poles, at an unknown place
     _left_out = 0
 
     def __init__(self) -> None:

@@ -27,6 +27,7 @@ from tactile_resonance.poles.likelihood import Solution, invert, moments
 from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.noise_level import (
+    CHANCE,
     Pieces,
     at_modes,
     is_rare,
@@ -41,9 +42,6 @@ if TYPE_CHECKING:
 
 # Noise alone looks like distortion this often; it is then weighted as such, at next to no loss.
 DISTORTION_PROBABILITY = 1e-2
-# Scatter that chance makes more often says nothing; the rarer it is, the more it counts. A test that is
-# passed or not would pass differences of the size of the noise, and ellipses would hold 80 to 90 %.
-CHANCE = 0.5
 # Fewer cannot show whether one is off, or all differ.
 FEWEST_RECORDS = 4
 # Share of errors (f0, damping) within the ellipse.
@@ -136,8 +134,7 @@ def noise_at_modes(plan: JointPlan, data: BinData, solution: Solution, scale: Fl
     weighted[:, first:] = variance
     poles = plan.poles_in_band(theta)
     sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)[1]
-    moved = sensitivity @ inverse[:, :a]
-    moved = np.stack([moved.real, moved.imag], axis=2)  # (batch, places, 2, n)
+    moved = real_rows(sensitivity) @ inverse[:, None, :a]  # (batch, places, 2, n)
     by_bin = (moved[..., a : a + b] @ numerator.T) * u[:, None, None]
     by_bin = by_bin + moved[..., a + b :] @ problem.transient.T
     by_bin = by_bin - (moved[..., :a] @ problem.denominator[:, :a].T) * model[:, None, None]

@@ -27,7 +27,7 @@ from tactile_resonance.poles.fit import (
     minimise,
 )
 from tactile_resonance.poles.likelihood import Rules, Solution
-from tactile_resonance.poles.model import RationalModel
+from tactile_resonance.poles.model import RationalModel, real_rows
 from tactile_resonance.poles.noise_level import FALSE_ALARM, VarianceModel, at_modes, model_variance
 from tactile_resonance.poles.starts import (
     SEVERAL_MODES,
@@ -89,8 +89,7 @@ class WeightedLines:
         theta, problem = solution.theta[:, 0], plan.problem
         poles = plan.poles_in_band(theta)
         sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)[1]  # (batch, places, a)
-        taken = sensitivity @ solution.marginal[:, 0, : sensitivity.shape[-1]]
-        taken = np.stack([taken.real, taken.imag], axis=2)
+        taken = real_rows(sensitivity) @ solution.marginal[:, :, : sensitivity.shape[-1]]
         phase = np.empty(0) if plan._delay_phase is None else plan._delay_phase
         bases = (np.stack([of.real.T, of.imag.T]) for of in problem.driven_bases[:2])
         ratio, squares = _at_modes(taken, theta, *bases, phase, self.data, self.sample)

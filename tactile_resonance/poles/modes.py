@@ -212,8 +212,8 @@ def significant_modes(
 def _farthest_of_noise(size: int, chance: npt.ArrayLike, dof: npt.ArrayLike) -> FloatArray:
     """Squared distance of so many values from zero that noise exceeds by chance.
 
-    In the covariance that they have for a level of complex `dof`: `noise_level.student_variance` times that of
-    the level found.
+    Where the level is that of residuals, of complex `dof`, their covariance is that of the level times
+    `noise_level.student_variance`.
     """
     dof, chance = np.asarray(dof), np.asarray(chance)
     limit = special.chdtri(size, chance)

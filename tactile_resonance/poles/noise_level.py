@@ -31,7 +31,8 @@ TINY = float(np.finfo(float).tiny)
 # Mean square of the residuals over that of the data, below which they are rounding.
 ROUNDED = 1e-22
 KINDS = ("flat", "sloped", "per line")
-# Samples at a mode above the curve over the band that chance makes more often say nothing; see `at_modes`.
+# What chance makes more often says nothing; the rarer it is, the more it counts. A test that is passed or not
+# would pass differences of the size of the noise, and ellipses would hold 80 to 90 %.
 CHANCE = 0.5
 
 

@@ -139,7 +139,7 @@ def legend_message(
     Parameters
     ----------
     unplaced : int
-        Points that failed where the tip was nobody knows: they count, and have no cross.
+        Points that failed at an unknown place: they count, and have no cross.
     """
     everything = _marker(header, "", 0, "CUBE")
     everything.action = everything.DELETEALL  # there may be fewer lines than before
