@@ -168,12 +168,15 @@ def test_a_page_that_cannot_go_on_ends_its_command(monkeypatch):
     from tactile_resonance.commands import live as command
     from tactile_resonance.nodes import client
 
+    until_s = time.monotonic() + 20.0
+
     class Nobody(contextlib.nullcontext):
         def __init__(self, live, namespace):
             super().__init__(self)
 
         def spin(self, seconds):
             time.sleep(0.01)
+            assert time.monotonic() < until_s, "the command goes on"
 
     def broken(live):
         raise ZeroDivisionError("of a map")
