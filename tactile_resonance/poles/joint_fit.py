@@ -16,7 +16,7 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.estimate import disagreement
-from tactile_resonance.poles.data import BinData, rules_between, with_noise
+from tactile_resonance.poles.data import BINS_PER_BAND, BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
@@ -169,24 +169,40 @@ class _Round:
         )
         return moments(self.plan.problem.tables, changed, self.solution.theta)[2][:, :, 1]
 
+    def at_modes(self, scale: FloatArray) -> FloatArray:
+        """(batch,) factor of the covariance from noise of this level; see `levels.noise_at_modes`."""
+        factor = np.ones(scale.size)
+        rows = np.flatnonzero((self.kind > 0) & _may_return(self.solution))
+        if rows.size and self.data.undriven:  # one level for all flat bins is known well enough
+            part = 1.0 if self.share is None else self.share[rows]
+            at = self.data.rows(rows), self.solution.rows(rows), scale[rows]
+            factor[rows] = noise_at_modes(self.plan, *at, part)
+        return factor
+
     def covariances(self, suspect: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(batch, s, s) of the coefficients that realisations share, from noise and in total."""
         solution, levels, shared = self.solution, self.levels, sum(self.plan.problem.sizes[:2])
         level, dof = levels.residual_level(suspect)
         between, between_dof = levels.noise_level(suspect)
-        pieces = np.where(levels.piece_dof > 2, levels.piece_dof / (levels.piece_dof - 2), 1.0)
+        nu = levels.piece_dof  # of what realisations differ by, else of the bins between harmonics
+        nu = np.where(self.kind == 2, BINS_PER_BAND, 0) if self.share is None else nu
+        pieces = np.where(nu > 2, nu / (nu - 2), 1.0)
         first, last = solution.normal[:, :, 0], solution.normal[:, :, 1]
         noise = solution.marginal[:, 0, :shared, :shared]
         if np.isnan(levels.between_dof).all():
             both = 0.5 * (level * student_variance(dof) * pieces)[:, None, None]
             return both * noise, both * noise
         if self.share is None:  # there is no less than the noise
+            level = np.where(nu > 1, level * (nu - 1) / nu, level)  # over variances from so few bins it is more
             more = np.maximum(level / between, 1.0)
         else:
             between, between_dof = levels.between, levels.between_dof
             more = level / between
             noise = solution.sandwich(first + self.normal_of_excited(self.share), shared)
         total = solution.sandwich(first + last * more[:, None, None, None], shared)
+        at_modes = self.at_modes(between)[:, None, None]
+        total += (at_modes - 1) * noise
+        noise = at_modes * noise
         scale = 0.5 * between * pieces
         total_dof = np.where(more == 1, between_dof, dof)
         return (
@@ -294,12 +310,8 @@ def _alone(fitted: _Round, last: bool) -> Judged:
     lack = lack.only_where(doubted & ~suspect)
     # others are fitted once more
     wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
-    rows = np.flatnonzero((fitted.kind > 0) & _may_return(solution))
-    if rows.size and data.undriven:  # one level for all bins, where they are flat, is known well enough
-        at = data.rows(rows), solution.rows(rows), scale[rows]
-        correction[rows] *= noise_at_modes(plan, *at)
     # real and imaginary part of a circular complex error have half its variance each
-    covariance = inverse * (0.5 * scale * correction)[:, None, None]
+    covariance = inverse * (0.5 * scale * correction * fitted.at_modes(scale))[:, None, None]
     known = plan.level_known
     return Judged.of(
         plan,
@@ -366,10 +378,11 @@ def _from_scatter(fitted: _Round) -> _Round:
     total, kind = smooth_variance(levels.line_variance * fitted.variance, gain, fitted.pieces)
     if fitted.data.undriven:
         # of distorted lines with too large weights the transients were wrong, and so the noise
-        data, noise, _ = with_noise(plan, fitted.plain, theta)
+        data, noise, of_noise = with_noise(plan, fitted.plain, theta)
         known = np.broadcast_to(data.residual_variance(g), g.shape)
         data = data.weighted(variance_y=data.variance_y + np.maximum(total - known, 0))
         share = known / np.maximum(total, known)
+        kind = np.maximum(kind, of_noise)
     else:
         input_noise = levels.excited[:, None] * (plan.input_noise_ratio or 0.0)
         rest = np.maximum(total - input_noise * gain, 1e-3 * total)

@@ -100,10 +100,13 @@ def level_of(
     return scale, cost, expected, suspect, noise * level[:, None], correction
 
 
-def noise_at_modes(plan: JointPlan, data: BinData, solution: Solution, scale: FloatArray) -> FloatArray:
-    """(batch,) factor of the covariance of points of one record each; see `noise_level.at_modes`.
+def noise_at_modes(
+    plan: JointPlan, data: BinData, solution: Solution, scale: FloatArray, part: FloatArray | float = 1.0
+) -> FloatArray:
+    """(batch,) factor of the covariance of points; see `noise_level.at_modes`.
 
-    Each undriven bin shows the noise there, and those beside a driven one the noise on it.
+    Each undriven bin shows the noise there, and those beside a driven one the noise on it. The records of a
+    point pool their noise.
 
     Parameters
     ----------
@@ -113,35 +116,41 @@ def noise_at_modes(plan: JointPlan, data: BinData, solution: Solution, scale: Fl
     solution : Solution
     scale : (batch,) float
         Level of the noise in units of the variances of the data.
+    part : (batch, K_e) float, optional
+        Of the variance of the residuals on driven bins that is noise; all of it when absent.
     """
     problem, first = plan.problem, data.undriven
-    (a, b, _), theta, inverse = problem.sizes, solution.theta[:, 0], solution.marginal[:, 0]
+    (a, b, _), theta, inverse = problem.sizes, solution.theta, solution.marginal
     alpha, beta, gamma = problem.split(theta)
-    of_a = alpha @ problem.denominator.T  # (batch, K), the undriven bins first
-    u, numerator = np.array(data.u[:, 0, data.order]), np.zeros((data.order.size, b), complex)
-    u[:, :first], numerator[first:] = 0, problem.numerator
-    model = (u * (beta @ numerator.T) + gamma @ problem.transient.T) / of_a
-    variance, weighted = data.residual_variance(problem.response(theta)), data.variance
-    own = problem.transient[:first] / of_a[:, :first, None]
-    taken = np.einsum("bki,bij,bkj->bk", own.conj(), inverse[:, a + b :, a + b :], own).real
-    free = np.maximum(1 - taken / (2 * weighted[:, :first]), 0.2)  # of a bin, less what the transient takes
-    sample = np.abs(data.y[:, 0, data.order[:first]] - model[:, :first]) ** 2 / free / scale[:, None]
+    of_a = alpha[:, :1] @ problem.denominator.T  # (batch, 1, K), the undriven bins first
+    u, numerator = np.array(data.u[..., data.order]), np.zeros((data.order.size, b), complex)
+    u[..., :first], numerator[first:] = 0, problem.numerator
+    model = (u * (beta[:, :1] @ numerator.T) + gamma @ problem.transient.T) / of_a
+    variance, weighted = data.residual_variance(problem.response(theta[:, 0])), data.variance
+    noise = part * variance
+    own = problem.transient[:first] / of_a[:, 0, :first, None]
+    taken = np.einsum("bki,bmij,bkj->bmk", own.conj(), inverse[..., a + b :, a + b :], own).real
+    free = np.maximum(1 - taken / (2 * weighted[:, None, :first]), 0.2)  # less what the transient takes
+    sample = np.abs(data.y[..., data.order[:first]] - model[..., :first]) ** 2 / free
+    sample = sample.mean(axis=1) / scale[:, None]
     each = first / plan.excited_at.size
     away = np.abs(plan.excited_at[:, None] - plan.others_at)
     beside = np.argsort(away, axis=1, kind="stable")[:, : max(2, 2 * round(each / 2))]
-    beyond = sample[:, beside].mean(axis=-1) - weighted[:, first:]  # what is on Y alone
-    ratio = np.concatenate([sample / weighted[:, :first], 1 + beyond / variance], axis=-1)
+    of_y = weighted[:, first:] - (variance - noise)  # noise on Y alone
+    on_lines = 1 + (sample[:, beside].mean(axis=-1) - of_y) / noise
+    ratio = np.concatenate([sample / weighted[:, :first], on_lines], axis=-1)
     weighted[:, first:] = variance
-    poles = plan.poles_in_band(theta)
-    sensitivity = plan.model_of(theta).residues_and_sensitivity(poles)[1]
-    moved = real_rows(sensitivity) @ inverse[:, None, :a]  # (batch, places, 2, n)
-    by_bin = (moved[..., a : a + b] @ numerator.T) * u[:, None, None]
+    poles = plan.poles_in_band(theta[:, 0])
+    sensitivity = plan.model_of(theta[:, 0]).residues_and_sensitivity(poles)[1]
+    moved = real_rows(sensitivity)[:, None] @ inverse[:, :, None, :a]  # (batch, M, places, 2, n)
+    by_bin = (moved[..., a : a + b] @ numerator.T) * u[:, :, None, None]
     by_bin = by_bin + moved[..., a + b :] @ problem.transient.T
-    by_bin = by_bin - (moved[..., :a] @ problem.denominator[:, :a].T) * model[:, None, None]
-    share = np.abs(by_bin) ** 2 / (np.abs(of_a) ** 2 * weighted)[:, None, None]
+    by_bin = by_bin - (moved[..., :a] @ problem.denominator[:, :a].T) * model[:, :, None, None]
+    share = np.sum(np.abs(by_bin) ** 2, axis=1) / (np.abs(of_a) ** 2 * weighted[:, None])[:, :, None]
+    share[..., first:] *= (noise / variance)[:, None, None]
     share /= share.sum(axis=-1, keepdims=True)
     squares = (share[..., :first] ** 2).sum(axis=-1) + (share[..., first:] ** 2).sum(axis=-1) / each
-    return at_modes((share * ratio[:, None, None]).sum(axis=-1), 1 / squares)
+    return at_modes((share * ratio[:, None, None]).sum(axis=-1), data.records / squares)
 
 
 @dataclass(frozen=True, eq=False)
