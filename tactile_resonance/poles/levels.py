@@ -30,8 +30,8 @@ from tactile_resonance.poles.noise_level import (
     CHANCE,
     Pieces,
     at_modes,
+    chance_of_pieces,
     is_rare,
-    moments_of_ratio,
     student_variance,
 )
 from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
@@ -91,10 +91,9 @@ def level_of(
     suspect = is_rare(cost / dof_e, dof_e, dof_o, MODEL_ERROR_PROBABILITY)
     correction = student_variance(dof)
     if by_piece.any():
-        mean, std = moments_of_ratio(BINS_PER_BAND)  # weights are from few bins
-        limit = dof_e * mean - np.sqrt(dof_e) * std * special.ndtri(MODEL_ERROR_PROBABILITY)
-        expected = np.where(by_piece, expected * mean, expected)
-        suspect = np.where(by_piece, cost > limit, suspect)
+        expected = np.where(by_piece, expected * BINS_PER_BAND / (BINS_PER_BAND - 1), expected)
+        chance = chance_of_pieces(cost / expected, dof_e, BINS_PER_BAND * lines / others, BINS_PER_BAND)
+        suspect = np.where(by_piece, chance < MODEL_ERROR_PROBABILITY, suspect)
         correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
     scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
     return scale, cost, expected, suspect, noise * level[:, None], correction
@@ -248,10 +247,7 @@ class Levels:
         ratio = cost / common_dof
         chance = special.fdtrc(2 * common_dof, 2 * excited_dof, ratio)
         if by_piece.any():
-            # sums over pieces of F(2 lines, 2 nu): as a chi-square of the same mean and variance
-            spread = (pieces.size + nu - 1) / (lines * (nu - 2))
-            of_pieces = special.chdtrc(2 / spread, 2 / spread * cost / expected)
-            chance = np.where(by_piece, of_pieces, chance)
+            chance = np.where(by_piece, chance_of_pieces(cost / expected, lines, pieces.size, nu), chance)
         return cls(
             common,
             between,

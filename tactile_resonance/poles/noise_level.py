@@ -130,9 +130,9 @@ class VarianceModel:
         if by_line.any():
             rare[by_line] = False
             if self.dof > 2:
-                mean, std = moments_of_ratio(self.dof)
-                above = (cost - free * mean) / (np.sqrt(free) * std)
-                rare |= by_line & (above > -special.ndtri(probability))
+                expected = free * self.dof / (self.dof - 1)
+                chance = chance_of_pieces(cost / expected, free, 1, self.dof)
+                rare |= by_line & (chance < probability)
         return rare
 
 
@@ -159,10 +159,25 @@ def at_modes(ratio: FloatArray, dof: FloatArray) -> FloatArray:
     return np.asarray(factor.max(axis=(1, 2), initial=1.0))
 
 
-def moments_of_ratio(dof: int) -> tuple[float, float]:
-    """Mean and deviation of F(2, 2 nu): of a power over a variance of so many complex degrees of freedom."""
-    mean = dof / (dof - 1)
-    return mean, mean * np.sqrt(dof / (dof - 2))
+def chance_of_pieces(
+    ratio: FloatArray, lines: FloatArray | int, size: float, dof: FloatArray | int
+) -> FloatArray:
+    """(batch,) how often noise alone exceeds a cost over its expectation, weighted by pieces of the band.
+
+    Lines of a piece share the error of its variance: sums over pieces of F(2 size, 2 dof), as a chi-square of
+    the same mean and variance.
+
+    Parameters
+    ----------
+    ratio : (batch,) float
+    lines : (batch,) float or int
+    size : float
+        Lines of a piece.
+    dof : (batch,) float or int
+        Complex degrees of freedom of the variance of a piece.
+    """
+    spread = (size + dof - 1) / (lines * (dof - 2))
+    return np.asarray(special.chdtrc(2 / spread, 2 / spread * ratio))
 
 
 def is_rare(
