@@ -416,6 +416,8 @@ def _has_total(batch: PolesBatch, index: tuple[int, ...]) -> bool:
 def _without_covariance(batch: PolesBatch, index: tuple[int, ...]) -> str:
     """Why there is none."""
     if np.isfinite(batch.cost[index]):
+        if _has_total(batch, index):
+            return "no line has a finite variance of the noise alone: the total covariance is known"
         return (
             "the variance of each line has too few degrees of freedom to estimate the uncertainty: "
             "record more periods or realisations"

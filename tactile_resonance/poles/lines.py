@@ -177,10 +177,15 @@ def lines_of_frf(frf: FRF) -> WeightedLines:
     g = frf.g.reshape(flat_shape)
     usable = np.isfinite(g)
     level_known = np.full(flat_shape[0], frf.variance is not None and frf.dof > 0)
-    variance = np.ones(flat_shape)
+    variance, noise = np.ones(flat_shape), None
+    if frf.variance_noise is not None and frf.variance_total is not None:
+        noise = frf.variance_noise.reshape(flat_shape)
     if frf.variance is not None and frf.dof > 0:
         variance = frf.variance.reshape(flat_shape)
         weighted = usable & (variance > 0) & (variance < np.inf)
+        if noise is not None:
+            of_noise = (noise > 0) & (noise < np.inf)
+            weighted &= of_noise | ~of_noise.any(axis=-1, keepdims=True)
         if not weighted.all():
             level_known = np.asarray((usable & (variance > 0)).any(axis=-1))
             variance = np.where(level_known[:, None], variance, 1.0)
@@ -197,7 +202,6 @@ def lines_of_frf(frf: FRF) -> WeightedLines:
         # noise is from bins between lines: neighbours share them where periods are few
         bins = (frf.periods - 1) * frf.realisations
         known = replace(known, independent_dof=min(frf.dof, bins))
-    noise = frf.variance_noise
     data = BinData.of(g[:, None], np.ones((1, 1, g.shape[1])), variance_y=weights)
     return WeightedLines(
         data,
@@ -205,7 +209,7 @@ def lines_of_frf(frf: FRF) -> WeightedLines:
         level_known,
         data.weighted(variance_y=np.where(usable, variance, 1.0)),
         frf.variance_total is not None,
-        None if noise is None or frf.variance_total is None else noise.reshape(flat_shape),
+        noise,
     )
 
 

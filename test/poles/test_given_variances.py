@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from poles.mode_at_250_hz import BARE, LINES_HZ, G, S, circular, frf, spectra
+from poles.mode_at_250_hz import BARE, LINES_HZ, NOISY, G, S, circular, frf, spectra
 from scipy import stats
 
 from benchmarks.poles_plant import (
@@ -15,7 +15,7 @@ from benchmarks.poles_plant import (
     judge,
 )
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.poles.identify import identify_batch, identify_spectra
+from tactile_resonance.poles.identify import identify_batch, identify_frf, identify_spectra
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.result import PolesStatus
 
@@ -201,3 +201,28 @@ def test_two_modes_taken_for_one_are_within_the_total_covariance(distance_hz):
     std = np.sqrt(result.total_covariance[told, 0, 0, 0])
     off = np.abs(result.f0_hz[told] - [250, 250 + distance_hz]).min(axis=-1)
     assert np.mean(off < 3 * std) > 0.8
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1e-7])
+def test_lines_without_a_variance_of_noise_are_left_out(value):
+    """Beside a variance in total the covariance of the whole point was NaN, for too few degrees of freedom."""
+    noise, total = np.full(41, 5e-7), np.full(41, 1e-6)
+    given = {"variance_total": total, "total_dof": 7}
+    keep = np.arange(41) != 7
+    noise[7] = value
+    poles = identify_frf(frf(variance_noise=noise, **given), structure=BARE)
+    assert poles.status is PolesStatus.OK
+    assert "1 lines without" in poles.message
+    lines = {"frequency_hz": LINES_HZ[keep], "g": NOISY[keep], "variance_noise": noise[keep]}
+    without = identify_frf(frf(**lines, variance_total=total[keep], total_dof=7), (200, 300), BARE)
+    np.testing.assert_allclose(poles.covariance, without.covariance, rtol=1e-4)
+    np.testing.assert_allclose(poles.total_covariance, without.total_covariance, rtol=1e-4)
+
+
+def test_total_variances_without_any_of_noise():
+    given = {"variance_total": np.full(41, 1e-6), "total_dof": 7}
+    poles = identify_frf(frf(variance_noise=np.full(41, np.nan), **given), structure=BARE)
+    assert poles.status is PolesStatus.NO_COVARIANCE
+    assert poles.covariance is None
+    assert poles.total_covariance is not None
+    assert "noise alone" in poles.message
