@@ -354,8 +354,11 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         "noise makes"
         for pole in poles[~real]
     ]
-    notes = [*left_out, *notes]
     there[there] = real
+    terms = batch.structure.numerator_order - batch.structure.order + 1
+    not_told = f"the delay is not told from {terms} residual terms: its own value and deviation mean little"
+    of_delay = [not_told] if batch.structure.delay and terms > 1 and there.any() else []
+    notes = [*left_out, *of_delay, *notes]
 
     def optional(array: FloatArray) -> FloatArray | None:
         values = array[index][there]
