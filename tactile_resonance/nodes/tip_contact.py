@@ -174,7 +174,7 @@ class TipContact:
             ):
                 self.touching, self.touched_ns = False, None
                 moved_n = self._state.zero_moved_n
-                # of a goal that was refused no contact was seen: what is told is of the one before
+                # a refused goal made no contact: the state still describes the one before
                 return 0.0 if math.isnan(moved_n) or not self._times.fields else moved_n
             state = self._state
             if state.cause == Cause.HELD.value and state.state == state.STATE_FAULT:

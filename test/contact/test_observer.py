@@ -178,7 +178,7 @@ def test_a_zero_has_moved_beyond_four_deviations_of_the_forces_that_came(rate_hz
 
 
 def test_the_force_of_the_moment_when_it_is_reached_holds_the_vibration_of_the_arm():
-    """Of a tip that shakes by s about the height that is told, on a slope k, it is off by k s."""
+    """A tip that shakes by s about its reported height, on a slope of k, changes the force by k s."""
     observer = pressed(0, 0.0)
     estimate = replace(observer.model.estimate(-PRESSED_M), force_std_n=0.0, stiffness_n_per_m=60.0)
     outcome = Outcome(observer, 0)

@@ -346,39 +346,28 @@ def test_a_scan_that_another_client_left_behind_can_be_cancelled(stack):
         other.destroy()
 
 
-def test_a_run_that_began_with_another_table_is_not_resumed(stack):
+@pytest.mark.parametrize(
+    ("name", "now", "began", "told"),
+    [
+        ("table_in_base", [0.0] * 6, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0], "[0.0, 0.0, 0.0, "),
+        ("contact", "none", "robot", "'none'; accepted is robot, with which the run began"),
+    ],
+)
+def test_a_run_that_began_otherwise_is_not_resumed(stack, name, now, began, told):
+    """Without a robot poles of air would count as those of its points: nothing brings the tip there."""
     stack.activate()
     future = stack.begin([], run_directory="mine")
     stack.client.cancel()
     run = Path(stack.ended(future).run_directory)
     facts = json.loads((run / "run.json").read_text())
-    table = facts["facts"]["scan_node"]["table_in_base"]
-    assert table == [0.0] * 6
-    table[2] = 0.1
+    assert facts["facts"]["scan_node"][name] == now
+    facts["facts"]["scan_node"][name] = began
     facts["crc32"] = checksum_of({key: facts[key] for key in facts if key != "crc32"})
     (run / "run.json").write_text(json.dumps(facts))
     outcome = stack.ended(stack.client.scan(run_directory="mine", resume=True))
     assert outcome.ending is Ending.REFUSED
-    assert outcome.message.startswith("table_in_base: got [0.0, 0.0, 0.0, ")
-    assert "with which the run began" in outcome.message
-
-
-@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
-def test_a_run_that_began_with_a_robot_is_not_resumed_without(stack):
-    """Poles of air would count as those of its points: nothing brings the tip there."""
-    stack.activate()
-    future = stack.begin([], run_directory="mine")
-    stack.client.cancel()
-    run = Path(stack.ended(future).run_directory)
-    facts = json.loads((run / "run.json").read_text())
-    assert facts["facts"]["scan_node"]["contact"] == "none"
-    facts["facts"]["scan_node"]["contact"] = "robot"
-    facts["crc32"] = checksum_of({key: facts[key] for key in facts if key != "crc32"})
-    (run / "run.json").write_text(json.dumps(facts))
-    outcome = stack.ended(stack.client.scan(run_directory="mine", resume=True))
-    assert outcome.ending is Ending.REFUSED
-    accepted = "accepted is robot, with which the run began, to resume it"
-    assert outcome.message == f"contact: got 'none'; {accepted}"
+    assert outcome.message.startswith(f"{name}: got {told}")
+    assert "with which the run began, to resume it" in outcome.message
 
 
 @pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)

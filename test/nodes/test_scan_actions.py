@@ -28,15 +28,20 @@ class Node:
         self.goal, self.refuses = serve, refuses
 
 
-@pytest.mark.parametrize("active", [True, False])
-def test_a_goal_accepted_as_the_node_is_deactivated_is_cancelled_at_once(monkeypatch, active):
-    """`deactivate` cancels what is under way: a goal that has not begun yet has no controls to be found by."""
+@pytest.fixture
+def in_this_thread(monkeypatch):
+    """Work of a goal is done at once."""
 
     async def here(node, work, name):
         return work()
 
     monkeypatch.setattr(scan_actions, "in_thread", here)
     monkeypatch.setattr(scan_actions, "end_goal", lambda goal, done: None)
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_a_goal_accepted_as_the_node_is_deactivated_is_cancelled_at_once(monkeypatch, in_this_thread, active):
+    """`deactivate` cancels what is under way: a goal that has not begun yet has no controls to be found by."""
     node = Node(active=True)
     goals = scan_actions.OneGoal(node, contextlib.nullcontext)
     monkeypatch.setattr(goals, "_require_free", lambda: None)
@@ -57,14 +62,8 @@ def test_a_goal_accepted_as_the_node_is_deactivated_is_cancelled_at_once(monkeyp
     assert cancelled == [not active]
 
 
-def test_what_is_asked_of_a_scan_is_refused_while_a_table_is_calibrated(monkeypatch):
+def test_what_is_asked_of_a_scan_is_refused_while_a_table_is_calibrated(in_this_thread):
     """It would be answered that it is done, and the arm would go on."""
-
-    async def here(node, work, name):
-        return work()
-
-    monkeypatch.setattr(scan_actions, "in_thread", here)
-    monkeypatch.setattr(scan_actions, "end_goal", lambda goal, done: None)
     node = Node(active=True)
     goals = scan_actions.OneGoal(node, contextlib.nullcontext)
     goals.serve_control("scan/pause", lambda controls: controls.paused.set())

@@ -120,7 +120,7 @@ def test_a_repetition_that_is_skipped_leaves_the_point_as_it_was_measured(tmp_pa
             return [entry[1] for entry in self.log if entry[0] == "touch"]
 
         def missing(self):
-            ask(self.touched)  # to skip: before the disturbed repetition comes again
+            ask(self.touched)  # to skip, before the disturbed repetition is attempted again
             return None
 
         def measure(self, design, label, seed, enough, recording, check):
