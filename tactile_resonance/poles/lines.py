@@ -92,7 +92,7 @@ class WeightedLines:
         taken = real_rows(sensitivity) @ solution.marginal[:, :, : sensitivity.shape[-1]]
         phase = np.empty(0) if plan._delay_phase is None else plan._delay_phase
         bases = (np.stack([of.real.T, of.imag.T]) for of in problem.driven_bases[:2])
-        ratio, squares = _at_modes(taken, theta, *bases, phase, self.data, self.sample)
+        ratio, squares = ratio_at_modes(taken, theta, *bases, phase, self.data, self.sample)
         each = known.dof if known.independent_dof is None else known.independent_dof
         return np.where(known.kind < 2, at_modes(ratio, each / squares), 1.0)
 
@@ -107,7 +107,7 @@ def _add_series(coefficients, basis, sums):
 
 
 @entry
-def _at_modes(taken, theta, basis_a, basis_b, phase, data, sample):
+def ratio_at_modes(taken, theta, basis_a, basis_b, phase, data, sample):
     """Of the lines that poles are known from, the mean ratio of a sample's variance to that of the data.
 
     And the sum of the squares of their shares in the variance, both (points, places, 2) for the real and the
