@@ -75,15 +75,18 @@ def poles_of_frf(
     structure = structure or ModelStructure()
     if frf.status is FrfStatus.FAILED or frf.frequency_hz.size == 0:
         return Poles(status=PolesStatus.FAILED, message=frf.message)
-    reason = _joint_impossible(frf, band_hz, structure)
-    if method == "joint" and reason:
-        raise ValueError(f"method: joint, but {reason}")
-    if method == "frf" or frf.bins is None or reason:
+    reason = ""
+    if method != "frf":
+        try:
+            joint = _plan_and_bins(frf.bins, band_hz, structure)
+        except ValueError as error:
+            if method == "joint":
+                raise ValueError(f"method: joint, but {error}") from None
+            reason = str(error)
+    if method == "frf" or reason:
         poles = identify_frf(frf, band_hz, structure)
-        if method == "auto" and frf.bins is not None:
-            poles = poles.noting(f"from the FRF: {reason}")
-        return poles
-    poles = identify_poles_from_bins(frf.bins, band_hz, structure)
+        return poles.noting(f"from the FRF: {reason}") if reason and frf.bins is not None else poles
+    poles = _of_plan(*joint)
     told = poles.status is PolesStatus.MODEL_ERROR or frf.periods == 1  # a transient is estimated here
     if frf.status is not FrfStatus.OK and not (frf.status is FrfStatus.MODEL_ERROR and told):
         poles = poles.noting(frf.message)
@@ -123,29 +126,6 @@ def poles_of_bands(frf: FRF, bands: Sequence[PoleBand], method: str = "auto") ->
     return replace(first, further=tuple(further))
 
 
-def _joint_impossible(frf: FRF, band_hz: tuple[float, float], structure: ModelStructure) -> str:
-    """Why there can be no joint estimate; empty where there can."""
-    bins = frf.bins
-    if bins is None:
-        return (
-            "the FRF brings no bins: they were not asked for, or too many"
-        )
-    low_hz, high_hz = bins.band_hz
-    margin = bins.resolution_hz * (1 + 1e-9)  # the band's ends need not lie on bins
-    if band_hz[0] <= low_hz - margin or band_hz[1] >= high_hz + margin:
-        return f"the bins cover {low_hz:g} to {high_hz:g} Hz of {band_hz[0]:g} to {band_hz[1]:g} Hz"
-    line_hz = bins.sample_rate_hz / bins.samples_per_period
-    lines = bins.harmonics * line_hz
-    count = int(((lines >= band_hz[0]) & (lines <= band_hz[1])).sum())
-    if count <= structure.fewest_lines:
-        return (
-            f"the band holds {count} excited lines, a record needs {structure.fewest_lines + 1}"
-        )
-    if structure.delay:
-        return "it estimates no delay"
-    return ""
-
-
 def identify_poles_from_records(
     u: npt.NDArray[np.floating],
     y: npt.NDArray[np.floating],
@@ -174,9 +154,9 @@ def identify_poles_from_records(
     """
     if np.ndim(u) not in (2, 3):
         raise ValueError(f"u: shape {np.shape(u)}, expected (P, N) or (M, P, N)")
-    if np.ndim(u) == 3 and len(u) == 1:
-        u, y = u[0], y[0]
-    plan = (JointPlan if np.ndim(u) == 2 else PoleEstimator)(
+    if np.ndim(u) == 2:
+        u, y = np.asarray(u)[None], np.asarray(y)[None]
+    plan = (PoleEstimator if len(u) > 1 else JointPlan)(
         sample_rate_hz,
         np.shape(u)[-1],
         np.shape(u)[-2],
@@ -208,13 +188,22 @@ def identify_poles_from_bins(
     ValueError
         If the bins do not cover the band, or as `JointPlan`.
     """
+    return _of_plan(*_plan_and_bins(bins, band_hz, structure or ModelStructure()))
+
+
+def _plan_and_bins(
+    bins: BandBins | None, band_hz: tuple[float, float], structure: ModelStructure
+) -> tuple[JointPlan, ComplexArray, ComplexArray]:
+    """What `_of_plan` takes; ``ValueError`` where there can be no joint estimate."""
+    if bins is None:
+        raise ValueError("the FRF brings no bins: they were not asked for, or too many")
     plan = _plan(
         bins.sample_rate_hz,
         bins.samples_per_period,
         bins.periods,
         whole_harmonics(bins.harmonics).tobytes(),
         (float(band_hz[0]), float(band_hz[1])),
-        structure or ModelStructure(),
+        structure,
         bins.u.shape[0] > 1,
     )
     first = plan.bins[0] - bins.first_bin
@@ -223,14 +212,13 @@ def identify_poles_from_bins(
             f"band_hz: {band_hz}, the bins cover {bins.band_hz[0]:g} to {bins.band_hz[1]:g} Hz"
         )
     here = slice(first, first + plan.bins.size)
-    u, y = bins.u[:, here], bins.y[:, here]
-    if u.shape[0] == 1:
-        u, y = u[0], y[0]
-    return _of_plan(plan, u, y)
+    return plan, bins.u[:, here], bins.y[:, here]
 
 
 def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
-    """Poles from bins: by all as excitation, without tones, with drift, as the record asks for."""
+    """Poles from bins (M, K): by all as excitation, without tones, with drift, as the record asks for."""
+    if len(u) == 1:
+        u, y = u[0], y[0]
     batch = plan.from_bins(u, y)
     poles = _poles_with_all_bins(plan, u, y, batch)
     if poles is not None:

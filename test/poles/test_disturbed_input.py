@@ -105,7 +105,7 @@ def test_realisations_with_a_disturbance():
 def test_a_joint_fit_that_does_not_converge_is_followed_by_the_frf(monkeypatch):
     u, y = record(1, kind="white", periods=4)
     monkeypatch.setattr(
-        "tactile_resonance.poles.estimator.identify_poles_from_bins",
+        "tactile_resonance.poles.estimator._of_plan",
         lambda *arguments, **options: Poles(status=PolesStatus.NOT_CONVERGED),
     )
     poles = analyse(Recording(u[None], y[None], RATE_HZ, ODD), band_hz=BAND_HZ).poles
@@ -122,7 +122,7 @@ def test_where_the_frf_gives_no_poles_either_the_first_answer_stays(monkeypatch)
     g = np.random.default_rng(1).standard_normal(ODD.size) + 0j
     frf = replace(frf, g=g, bins=band_bins(spectrum, **kind, band_hz=BAND_HZ), status=FrfStatus.OK)
     lost = Poles(status=PolesStatus.NOT_CONVERGED, message="the iterations found no minimum")
-    monkeypatch.setattr(estimator, "identify_poles_from_bins", lambda *arguments, **options: lost)
+    monkeypatch.setattr(estimator, "_of_plan", lambda *arguments, **options: lost)
     poles = estimator.poles_of_frf(frf, BAND_HZ, ModelStructure(2, 2))
     assert poles.status is PolesStatus.NOT_CONVERGED
     assert poles.message.startswith("the iterations found no minimum; from the FRF: ")
