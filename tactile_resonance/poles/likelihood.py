@@ -196,7 +196,7 @@ class _Work(NamedTuple):
     cross : (G, 2) float
         Sum of ``error conj(u)`` over undriven bins.
     at, trial : (G, M, n + 1) float
-        Coefficients in the order C, A, B: what records do not share comes first; and 1.
+        Coefficients [A without its last, B, C], and 1.
     gram, there : (G, M, 2, n (n + 1) + 1) float
         Normal matrices with half the gradients of undriven and driven bins, flat (n, n + 1) matrices; at
         `at` and at `trial`.
@@ -478,34 +478,35 @@ def _sums(tables, part, work, which, theta, kind, gram, cost):
 
 
 @inner
-def _eliminate(system, count):
-    """Eliminate the first unknowns from the equations below, of points side by side.
+def _eliminate(system, first):
+    """Eliminate the unknowns from `first` on, the last one at first, of points side by side.
 
-    Pivots become their inverses, NaN where one is not above 0.
+    Rows hold the right side, then coefficients up to the diagonal. Pivots become their inverses, NaN where one
+    is not above 0.
     """
-    rows, width, points = system.shape
-    for i in range(count):
-        pivot = system[i, i]
+    rows, _, points = system.shape
+    for i in range(rows - 1, first - 1, -1):
+        pivot = system[i, i + 1]
         for g in range(points):
             pivot[g] = 1 / pivot[g] if pivot[g] > 0 else np.nan
-        for j in range(i + 1, rows):
-            of = system[i, j]
-            for k in range(j, width):
+        for j in range(i):
+            of = system[i, j + 1]
+            for k in range(j + 2):
                 other, to = system[i, k], system[j, k]
                 for g in range(points):
                     to[g] -= of[g] * pivot[g] * other[g]
 
 
 @inner
-def _substitute(system, count, first, step):
-    """Solve the first `count` equations that are left of a `system`, whose unknowns begin at `first`."""
-    _, width, points = system.shape
-    for i in range(count - 1, -1, -1):
-        to, right, pivot = step[first + i], system[i, width - 1], system[i, i]
+def _substitute(system, first, step):
+    """Solve for the unknowns from `first` on, which `_eliminate` has taken out of the equations before."""
+    rows, _, points = system.shape
+    for i in range(first, rows):
+        to, right, pivot = step[i], system[i, 0], system[i, i + 1]
         for g in range(points):
             to[g] = right[g]
-        for j in range(i + 1, width - 1):
-            of, known = system[i, j], step[first + j]
+        for j in range(i):
+            of, known = system[i, j + 1], step[j]
             for g in range(points):
                 to[g] -= of[g] * known[g]
         for g in range(points):
@@ -513,7 +514,7 @@ def _substitute(system, count, first, step):
 
 
 @inner
-def _solve(work, which, c, damping):
+def _solve(work, which, damping):
     """Solve the normal equations of some points side by side; steps NaN where they are singular.
 
     Own coefficients of each record are eliminated first: the cost of a step grows as M, not as its cube
@@ -522,28 +523,30 @@ def _solve(work, which, c, damping):
     decrements of the cost.
     """
     gram, systems, total, step, fall = work.gram, work.systems, work.shared, work.step, work.fall
-    (records, n, points), shared, width = step.shape, total.shape[0], total.shape[1] + c
+    (records, n, points), shared, width = step.shape, total.shape[0], systems.shape[2]
     total[:] = 0.0
     for m in range(records):
         system = systems[m]
         for g in which:
             first, second = gram[g, m, 0], gram[g, m, 1]
             for i in range(n):
-                for j in range(i, width):
-                    system[i, j, g] = first[i * width + j] + second[i * width + j]
-                system[i, i, g] *= 1 + 1e-15 + damping[g]
-        _eliminate(system, c)
+                row = i * width
+                system[i, 0, g] = first[row + n] + second[row + n]
+                for j in range(i, n):
+                    system[j, i + 1, g] = first[row + j] + second[row + j]
+                system[i, i + 1, g] *= 1 + 1e-15 + damping[g]
+        _eliminate(system, shared)
         for i in range(shared):
-            for j in range(i, shared + 1):
-                of, to = system[c + i, c + j], total[i, j]
+            for j in range(i + 2):
+                of, to = system[i, j], total[i, j]
                 for g in range(points):
                     to[g] += of[g]
-    _eliminate(total, shared)
-    _substitute(total, shared, c, step[0])
+    _eliminate(total, 0)
+    _substitute(total, 0, step[0])
     fall[:] = 0.0
     for m in range(records):
-        step[m, c:] = step[0, c:]
-        _substitute(systems[m], c, 0, step[m])
+        step[m, :shared] = step[0, :shared]
+        _substitute(systems[m], shared, step[m])
         for g in which:
             for i in range(n):
                 at = i * width + n
@@ -551,33 +554,15 @@ def _solve(work, which, c, damping):
 
 
 @inner
-def _inside(theta, point, c, at, g):
-    """Coefficients in the order C, A, B from [A, B, C]."""
-    n = theta.shape[2]
-    at[g, :, :c] = theta[point, :, n - c :]
-    at[g, :, c:n] = theta[point, :, : n - c]
-
-
-@inner
-def _outside(at, g, c, theta, point):
-    """Coefficients in the order [A, B, C] from C, A, B."""
-    n = theta.shape[2]
-    theta[point, :, n - c :] = at[g, :, :c]
-    theta[point, :, : n - c] = at[g, :, c:n]
-
-
-@inner
-def _unpacked(gram, g, c, normal, point):
-    """Normal matrices (points, M, 2, n, n) in the order of theta."""
+def _unpacked(gram, g, normal, point):
+    """Normal matrices (points, M, 2, n, n)."""
     n = normal.shape[3]
     for m in range(normal.shape[1]):
         for part in range(2):
             for i in range(n):
-                at = i + n - c if i < c else i - c
                 for j in range(i, n):
-                    to = j + n - c if j < c else j - c
                     value = gram[g, m, part, i * (n + 1) + j]
-                    normal[point, m, part, at, to] = normal[point, m, part, to, at] = value
+                    normal[point, m, part, i, j] = normal[point, m, part, j, i] = value
 
 
 @entry
@@ -600,21 +585,20 @@ def moments(tables, data, theta):
     normal : (points, M, 2, n, n) float
     """
     points, records, n = theta.shape
-    c = tables.c
     work, which = _memory(tables, 1, records), np.zeros(1, np.int64)
     cost, gradient = np.empty((points, 2)), np.empty((points, records, n))
     normal = np.empty((points, records, 2, n, n))
     for point in range(points):
         _load(data, point, work.values[0], work.power[0, 1])
-        _inside(theta, point, c, work.at, 0)
+        work.at[0, :, :n] = theta[point]
         for part in range(2):
             _sums(tables, part, work, which, work.at, EXACT, work.gram, work.cost)
         cost[point] = work.cost[0]
-        _unpacked(work.gram, 0, c, normal, point)
+        _unpacked(work.gram, 0, normal, point)
         for m in range(records):
             for i in range(n):
-                to, k = i + n - c if i < c else i - c, i * (n + 1) + n
-                gradient[point, m, to] = work.gram[0, m, 0, k] + work.gram[0, m, 1, k]
+                k = i * (n + 1) + n
+                gradient[point, m, i] = work.gram[0, m, 0, k] + work.gram[0, m, 1, k]
     return cost, gradient, normal
 
 
@@ -629,7 +613,7 @@ def _start(tables, work, which):
         else:
             _sums(tables, 0, work, which, work.at, kind, work.gram, work.cost)
         _sums(tables, 1, work, which, work.at, kind, work.gram, work.cost)
-        _solve(work, which, tables.c, undamped)
+        _solve(work, which, undamped)
         for g in which:
             found = np.isfinite(work.fall[g])
             for m in range(work.at.shape[1]):
@@ -710,7 +694,7 @@ def _from_noise(tables, work, which, rules, noise, plain, last_fall):
             _weight_with(work.values, work.gram, work.cost, g, before, variance_y, variance_u)
         _sums(tables, 1, work, which, work.at, EXACT, work.gram, work.cost)
         if not last:
-            _solve(work, which, c, np.zeros(work.fall.size))
+            _solve(work, which, np.zeros(work.fall.size))
             for g in which:
                 if np.isfinite(work.fall[g]):
                     work.at[g, :, :n] -= work.step[:, :, g]
@@ -764,7 +748,7 @@ def _descend(tables, work, which, rules, last_fall, total, converged):
     count = which.size
     for _ in range(rules.iterations):
         left = 0
-        _solve(work, which[:count], c, damping)
+        _solve(work, which[:count], damping)
         for g in which[:count]:
             if not np.isfinite(total[g]) or damping[g] > MOST_DAMPING:
                 continue
@@ -893,29 +877,25 @@ def invert(matrices):
 @inner
 def _marginals(gram, g, c, whole, inverse, scale, row, marginal, leverage, point):
     """Blocks of the inverse of a point's normal matrix, and what they add up to; its condition number."""
-    records, n = marginal.shape[1], marginal.shape[2]
-    size, width = whole.shape[0], n + 1
-    own = size - (n - c)  # of all records, which come first
+    (_, records, n, _), width, shared = marginal.shape, marginal.shape[2] + 1, marginal.shape[2] - c
     whole[:] = 0.0
     for m in range(records):
         for i in range(n):
-            to = i + m * c if i < c else own + i - c
+            to = i if i < shared else i + m * c
             for j in range(i, n):
-                at = j + m * c if j < c else own + j - c
-                value = gram[g, m, 0, i * width + j] + gram[g, m, 1, i * width + j]
-                whole[to, at] += value
-    for i in range(size):
+                at = j if j < shared else j + m * c
+                whole[to, at] += gram[g, m, 0, i * width + j] + gram[g, m, 1, i * width + j]
+    for i in range(whole.shape[0]):
         for j in range(i):
             whole[i, j] = whole[j, i]
     condition = _inverted(whole, inverse, scale, row)
     leverage[point, 0] = leverage[point, 1] = 0.0
     for m in range(records):
         for i in range(n):
-            from_i, to_i = (i + m * c, i + n - c) if i < c else (own + i - c, i - c)
+            from_i = i if i < shared else i + m * c
             for j in range(i, n):
-                from_j, to_j = (j + m * c, j + n - c) if j < c else (own + j - c, j - c)
-                value = inverse[from_i, from_j]
-                marginal[point, m, to_i, to_j] = marginal[point, m, to_j, to_i] = value
+                value = inverse[from_i, j if j < shared else j + m * c]
+                marginal[point, m, i, j] = marginal[point, m, j, i] = value
                 value *= 1.0 if i == j else 2.0
                 leverage[point, 0] += value * gram[g, m, 0, i * width + j]
                 leverage[point, 1] += value * gram[g, m, 1, i * width + j]
@@ -956,7 +936,7 @@ def minimise(tables, data, start, rules):
         for g in range(count):
             _load(data, first + g, work.values[g], work.power[g, 1])
             if start.shape[0] > 0:
-                _inside(start, first + g, c, work.at, g)
+                work.at[g, :, :n] = start[first + g]
         if start.shape[0] == 0:
             _start(tables, work, which)
         if rules.pieces > 0:
@@ -969,13 +949,13 @@ def minimise(tables, data, start, rules):
         _residuals(tables, work, which, first, residual)
         for g in range(count):
             point = first + g
-            _outside(work.at, g, c, theta, point)
+            theta[point] = work.at[g, :, :n]
             part_cost[point, 0], part_cost[point, 1] = work.cost[g, 0], work.cost[g, 1]
             condition[point] = _marginals(
                 work.gram, g, c, whole, inverse, scale, row, marginal, leverage, point
             )
             if records > 1:
-                _unpacked(work.gram, g, c, normal, point)
+                _unpacked(work.gram, g, normal, point)
     return Solution(
         theta, cost, part_cost, residual, converged, normal, marginal, condition, leverage, noise, plain
     )

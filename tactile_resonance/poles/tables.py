@@ -53,14 +53,14 @@ if TYPE_CHECKING:
 # Of fits that are only compared: a mode too many, which no data determine, converges slowly and nowhere
 # in particular.
 COMPARISON = Rules(iterations=8)
-# Weight of the products of two kinds of coefficients, of C, A and B in this order.
+# Weight of the products of two kinds of coefficients, of A, B and C in this order.
 WEIGHTS = {
-    (0, 0): ROW_CC,
-    (0, 1): ROW_AC,
-    (0, 2): ROW_BC,
-    (1, 1): ROW_AA,
-    (1, 2): ROW_AB,
-    (2, 2): ROW_BB,
+    (0, 0): ROW_AA,
+    (0, 1): ROW_AB,
+    (0, 2): ROW_AC,
+    (1, 1): ROW_BB,
+    (1, 2): ROW_BC,
+    (2, 2): ROW_CC,
 }
 
 
@@ -78,7 +78,7 @@ class Part(NamedTuple):
     row : (pairs,) int
         That row; less one and with a minus where nothing is there yet.
     place : (pairs, 2) int
-        Which coefficient each belongs to, in the order C, A, B and 1.
+        Which coefficient each belongs to, in the order A, B, C and 1.
     products : (blocks, pairs, 2 BLOCK) float
         Products of basis functions, real or imaginary parts, in pairs with the same weight.
     weight : (pairs,) int
@@ -99,7 +99,7 @@ class Part(NamedTuple):
 
     @classmethod
     def of(cls, last: ComplexArray, bases: Sequence[ComplexArray], n: int) -> Part:
-        """Of the last polynomial of A (K,), bases (K, terms) of C, A and B, and all coefficients."""
+        """Of the last polynomial of A (K,), bases (K, terms) of A, B and C, and all coefficients."""
         bins, empty = last.size, -last.size % BLOCK
         last = np.append(last, np.ones(empty))
         functions = [
@@ -110,17 +110,14 @@ class Part(NamedTuple):
         by_row: dict[int, list[tuple[FloatArray, int]]] = {ROW_A: [], ROW_A + 1: []}
         by_weight: dict[int, list[tuple[FloatArray, int]]] = {}
         for i, (f, kind) in enumerate(functions):
-            row, weight = (ROW_C, ROW_A, ROW_B)[kind], (ROW_OF_C, ROW_OF_A, ROW_OF_B)[kind]
+            row, weight = (ROW_A, ROW_B, ROW_C)[kind], (ROW_OF_A, ROW_OF_B, ROW_OF_C)[kind]
             for k, values in enumerate((f.real, f.imag)):
                 if np.any(values):
                     by_row.setdefault(row + k, []).append((values, i))
             # a complex weight times the product, its real part
             products = [(weight, f, n)]
             for j, (g, its) in enumerate(functions[i:], i):
-                backwards = kind == 0 and its > 0  # weights are of conj(A) C and conj(B) C
-                products.append(
-                    (WEIGHTS[kind, its], f * g.conj() if backwards else f.conj() * g, j)
-                )
+                products.append((WEIGHTS[kind, its], f.conj() * g, j))
             for weight, values, j in products:
                 parts = (
                     [values.real]
@@ -230,11 +227,12 @@ class Problem:
         compiled()  # here and not in the first fit, whose time may matter
         first, (a, b, c) = self.undriven, self.sizes
         n = a + b + c
+        of_b = np.append(np.zeros((first, b), complex), self.numerator, axis=0)
         undriven, driven = (
-            Part.of(of_a[:, a], [of_c, of_a[:, :a], *of_b], n)
-            for of_a, of_c, *of_b in (
-                (self.denominator[:first], self.transient[:first]),
-                (self.denominator[first:], self.transient[first:], self.numerator),
+            Part.of(of_a[:, a], [of_a[:, :a], of_b, of_c], n)
+            for of_a, of_b, of_c in (
+                (x[part] for x in (self.denominator, of_b, self.transient))
+                for part in (slice(first), slice(first, None))
             )
         )
         return Tables(undriven, driven, a, b, c, first > 0 and self.numerator.shape[0] >= n)
