@@ -278,7 +278,6 @@ def _judged(
         lacking=np.where(suspect[:, None], lack.found, np.nan),
         doubt=lack.doubt,
         remark=lack.remarks,
-        dispensable=of_fit.dispensable(lines.data, fit),
     )
     return of_fit, judged
 

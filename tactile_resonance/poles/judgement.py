@@ -75,8 +75,6 @@ class Judged:
     doubt : (batch,) object
         What counts in the covariances of a point, but not for which of its modes are significant: (n, n) of
         the coefficients, of which the first p belong to `covariance`; None: nothing. See `lacking.Lack`.
-    dispensable : (batch, places) bool
-        Modes without which the fit is as good; see `starts`.
     remark : (batch,) object
         A further note for people; empty: none.
     """
@@ -96,7 +94,6 @@ class Judged:
     noise_variance: FloatArray
     systematic: FloatArray
     lacking: FloatArray
-    dispensable: BoolArray
     doubt: npt.NDArray[np.object_]
     remark: npt.NDArray[np.object_]
 
@@ -118,7 +115,6 @@ class Judged:
             "noise_variance": ((batch, 2), np.nan),
             "systematic": ((batch, places, 2, 2), 0.0),
             "lacking": ((batch, 3), np.nan),
-            "dispensable": ((batch, places), False),
         }
         for name in nothing.keys() - values.keys():
             values[name] = np.full(*nothing[name])
@@ -206,7 +202,6 @@ def assemble(
         free = np.maximum(judged.lines - tested.shape[-1] / 2, 1)
         dof = np.where(of_residuals, free, np.inf)
     significant, distance = significant_modes(model, quantities, tested, judged.lines, dof)
-    significant &= ~judged.dispensable
     in_doubt = [k for k, matrix in enumerate(judged.doubt) if matrix is not None]
     if in_doubt:
         covariance = covariance.copy()
@@ -220,7 +215,7 @@ def assemble(
         significant &= ~_sum_of_hidden(poles, significant)
     if (less := plan.poorer) is not None:
         certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
-        asked = beside_others(poles, significant) & ~judged.dispensable & certain[:, None]
+        asked = beside_others(poles, significant) & certain[:, None]
         significant |= _needed(judged, structure.parameters, asked, partial(costs, less))
     remark, notes = judged.remark.copy(), [_without_lost_totals(quantities, significant)]
     if poles.shape[-1] > 1:

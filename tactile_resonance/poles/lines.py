@@ -29,13 +29,7 @@ from tactile_resonance.poles.fit import (
 from tactile_resonance.poles.likelihood import Rules, Solution
 from tactile_resonance.poles.model import RationalModel, real_rows
 from tactile_resonance.poles.noise_level import FALSE_ALARM, VarianceModel, at_modes, model_variance
-from tactile_resonance.poles.starts import (
-    SEVERAL_MODES,
-    best_of_split,
-    dispensable,
-    exchanged,
-    moved_to,
-)
+from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split, exchanged, moved_to
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import FitPlan, Problem
 
@@ -427,18 +421,6 @@ class LinesPlan(FitPlan):
         row = _first_usable(data)
         found = least_squares(plan.problem, row, None, None, plan.start_size)
         return exchanged(plan, row, found)[0] if np.isfinite(found.cost) else plan
-
-    def dispensable(self, data: BinData, solution: Solution) -> BoolArray:
-        """(batch, places) modes in the band without which the fit is as good, where many are fitted."""
-        out = np.zeros((len(data.y), self.structure.order // 2), bool)
-        if self.structure.delay or self.structure.order <= LARGEST_BATCHED_ORDER:
-            return out
-        modes = self.poles_in_band(solution.theta[:, 0])
-        for k in np.flatnonzero(solution.converged):
-            row, theta = data.rows(slice(k, k + 1)), solution.theta[k, 0]
-            poles = dispensable(self, row, theta, float(solution.cost[k]))
-            out[k] = np.isclose(modes[k][:, None], poles, 1e-6, 0).any(axis=-1)
-        return out
 
     def of_size(self, row: BinData, size: FloatArray) -> LinesPlan | None:
         """Plan with bases orthonormal in the weights of a point where ``|A|^2`` is `size` (F,).

@@ -9,10 +9,6 @@ In models of many modes Sanathanan-Koerner iterations place some poles on noise,
 equations with the model's own denominator. From there a fit ends in a minimum in which a true mode is not
 fitted at all. The score test of `lacking` shows where one is missing; the fit begins anew with a mode there in
 place of the one that is missed least, and so on while the cost falls.
-
-A wide mode across others is the hull of all of them where noise hides each alone. Its residue seems certain,
-while the others would take its place: it counts only where the model without it, fitted anew, is worse than
-noise explains (`modes.fall_of_noise`).
 """
 
 from __future__ import annotations
@@ -32,8 +28,6 @@ from tactile_resonance.poles.fit import (
 )
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
 from tactile_resonance.poles.likelihood import Solution
-from tactile_resonance.poles.model import PolynomialBasis
-from tactile_resonance.poles.modes import fall_of_noise
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.lines import LinesPlan
@@ -54,8 +48,6 @@ CHANCE = 0.3
 STARTS = 3
 # Poles at which a mode is tried in one pass: of thousands of lines more take gigabytes.
 TRIED_AT_ONCE = 128
-# Poles nearer than this part of a half width are of the same mode.
-SAME = 0.5
 
 
 def best_of_split(plan: FitPlan, data: BinData, solution: Solution) -> Solution:
@@ -158,7 +150,7 @@ def exchanged(
             break
         more = np.array([missing, np.conj(missing)])
         starts = [np.append(rest, more) for rest in _one_less(_poles(plan, found))]
-        starts.sort(key=lambda poles: _linear_cost(plan, row, poles))
+        starts.sort(key=lambda poles: _cost_from(plan, row, poles))
         for start in starts[:STARTS]:
             again = _minimum_from(plan, row, start)
             if again is not None and again[1].cost < found.cost * (1 - 1e-9):
@@ -180,41 +172,6 @@ def moved_to(
     return least_squares(plan.problem, row, start, None, plan.start_size)
 
 
-@np.errstate(all="ignore")
-def dispensable(plan: LinesPlan, row: BinData, theta: FloatArray, cost: float) -> ComplexArray:
-    """(N,) poles above the real axis [rad/s] of modes across others that take their place in a new fit.
-
-    Parameters
-    ----------
-    plan : LinesPlan
-    row : BinData
-        Of one point.
-    theta : (n,) float
-        Its fit.
-    cost : float
-    """
-    poles, less = plan.model_of(theta[None]).poles_rad_s()[0], plan.poorer
-    above = poles[poles.imag > 0]
-    if less is None:
-        return np.empty(0, complex)
-    lines = int(row.lines[0])
-    limit = fall_of_noise(lines) * cost / (lines - theta.size / 2)
-    out = []
-    for k, pole in enumerate(above):
-        apart = np.abs(np.delete(above, k).imag - pole.imag)
-        if not (apart < abs(pole.real)).any():
-            continue
-        without = _minimum_from(less, row, _without(poles, k))
-        if without is None:
-            continue
-        there, fit = exchanged(without[0], row, without[1])
-        # one of the others that noise made may have become this one, which is needed then
-        again = np.abs(_poles(there, fit) - pole) < SAME * abs(pole.real)
-        if fit.cost < cost + limit and not again.any():
-            out.append(pole)
-    return np.array(out, complex)
-
-
 def _poles(plan: LinesPlan, solution: DenseSolution) -> ComplexArray:
     return plan.model_of(solution.theta[None]).poles_rad_s()[0]
 
@@ -232,20 +189,15 @@ def _minimum_from(
     return (there, solution) if np.isfinite(solution.cost) else None
 
 
-def _without(poles: ComplexArray, k: int) -> ComplexArray:
-    """All but the k-th complex pair, in the order of the poles above the real axis."""
-    above, below = poles[poles.imag > 0], poles[poles.imag < 0]
-    mirrored = np.argmin(np.abs(below - above[k].conj()))
-    real = np.sort_complex(poles[poles.imag == 0])
-    return np.concatenate([np.delete(above, k), np.delete(below, mirrored), real])
-
-
 def _one_less(poles: ComplexArray) -> list[ComplexArray]:
     """All but each complex pair, and all but two real poles next to each other."""
-    is_complex = poles.imag != 0
-    real = np.sort_complex(poles[~is_complex])
-    pairs = [np.append(poles[is_complex], np.delete(real, [k, k + 1])) for k in range(0, real.size - 1, 2)]
-    return [_without(poles, k) for k in range(int((poles.imag > 0).sum()))] + pairs
+    above, below, real = poles[poles.imag > 0], poles[poles.imag < 0], poles[poles.imag == 0]
+    real = np.sort_complex(real)
+    mirrored = [np.argmin(np.abs(below - pole.conj())) for pole in above]
+    return [
+        *(np.concatenate([np.delete(above, k), np.delete(below, m), real]) for k, m in enumerate(mirrored)),
+        *(np.concatenate([above, below, np.delete(real, [k, k + 1])]) for k in range(0, real.size - 1, 2)),
+    ]
 
 
 def _most_lacking(
@@ -299,24 +251,8 @@ def _falls(
     return np.where(determinant > LEAST_LEFT * whole, fall, 0.0)
 
 
-def _linear_cost(plan: LinesPlan, row: BinData, poles: ComplexArray) -> float:
-    """Cost with given poles and the residues that fit best, of a variance that does not depend on them."""
-    roots = plan.variable.of_s(poles)
-    x = plan.x[:, None]
-    above, real = roots[roots.imag > 0], roots[roots.imag == 0]
-    first, second, single = 1 / (x - above), 1 / (x - above.conj()), 1 / (x - real)
-    terms = plan.structure.numerator_order - plan.structure.order
-    rest = PolynomialBasis.on_lines(plan.x, max(terms, 0)).values if terms >= 0 else np.empty((x.size, 0))
-    columns = np.concatenate([first + second, 1j * (first - second), single, rest], axis=1)
-    variance = row.variance[0]
-    used = np.isfinite(variance)
-    weight = 1 / np.sqrt(variance[used])
-    columns = columns[used] * (weight * row.u[0, 0][used])[:, None]
-    rows = np.concatenate([columns.real, columns.imag])
-    rows /= np.linalg.norm(rows, axis=0)
-    y = row.y[0, 0][used] * weight
-    right = np.concatenate([y.real, y.imag])
-    if not np.isfinite(rows).all():
-        return np.inf
-    basis = np.linalg.qr(rows)[0]
-    return float(right @ right - np.sum((basis.T @ right) ** 2))
+def _cost_from(plan: LinesPlan, row: BinData, poles: ComplexArray) -> float:
+    """Cost with given poles [rad/s] and the numerator that fits best."""
+    error = Linearised.of(plan.problem, row, _coefficients(plan, row, poles)).residual
+    cost = float(np.sum(error.real**2 + error.imag**2))
+    return cost if np.isfinite(cost) else np.inf
