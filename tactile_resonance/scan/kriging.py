@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy.typing as npt
 from scipy.linalg import cholesky, eigh, lapack, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
+from scipy.spatial.distance import cdist, pdist
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.fields import require
@@ -124,14 +125,25 @@ class KrigedSurface:
 
     Attributes
     ----------
-    processes : tuple of k
-        Of lengths, sizes and scatters that the points allow; one where many points determine these.
+    xy_m : (n, 2) float
+    values, noise_std : (n,) float
+    constants : (k, 3) float
+        Lengths [m], sizes and scatters that the points allow; one row where many points determine these.
     shares : (k,) float
         Their probabilities.
     """
 
-    processes: tuple[Process, ...]
+    xy_m: FloatArray
+    values: FloatArray
+    noise_std: FloatArray
+    constants: FloatArray
     shares: FloatArray
+
+    @cached_property
+    def processes(self) -> tuple[Process, ...]:
+        """(k,) of the constants, each with all points known."""
+        known = self.xy_m, self.values, self.noise_std
+        return tuple(Process.of(*known, *each) for each in self.constants.tolist())
 
     @property
     def likeliest(self) -> Process:
@@ -143,88 +155,30 @@ class KrigedSurface:
 
         The standard deviation is that of the quantity at the place, with its scatter, not of a new measurement
         of it; it includes that of the mean and, of up to `MIXED_POINTS` points, of length, size and scatter.
+        Beyond `MOST_JOINT` points both, and the mean, are those of the neighbours of tiles of the places.
         """
         at = np.asarray(xy_m, float)
-        moments = np.array([process.moments(at.reshape(-1, 2)) for process in self.processes])
-        values, variances = moments.swapaxes(0, 1)  # (k, q)
-        value = self.shares @ values
-        variance = self.shares @ (variances + (values - value) ** 2)
-        return value.reshape(at.shape[:-1]), np.sqrt(variance).reshape(at.shape[:-1])
-
-
-@dataclass(frozen=True, eq=False)
-class TiledSurface:
-    """A quantity known at many points: `KrigedSurface` tile by tile, of one length, size and scatter.
-
-    Attributes
-    ----------
-    xy_m : (n, 2) float
-    values, noise_std : (n,) float
-    length_m, process_std, scatter : float
-    """
-
-    xy_m: FloatArray
-    values: FloatArray
-    noise_std: FloatArray
-    length_m: float
-    process_std: float
-    scatter: float
-
-    def predict(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """As `KrigedSurface.predict`; the mean is that of each tile's neighbours."""
-        at = np.asarray(xy_m, float)
         flat = at.reshape(-1, 2)
-        found = np.empty((2, len(flat)))
-        low_m, side_m = flat.min(axis=0), max(float(np.max(np.ptp(flat, axis=0))), 1e-9) / _ALONG
-        tiles, tile_of = np.unique(
-            np.floor((flat - low_m) / side_m).astype(int), axis=0, return_inverse=True
-        )
-        points = cKDTree(self.xy_m)
+        if len(self.xy_m) > MOST_JOINT:
+            value, std = self._by_tiles(flat)
+        else:
+            moments = np.array([process.moments(flat) for process in self.processes])
+            values, variances = moments.swapaxes(0, 1)  # (k, q)
+            value = self.shares @ values
+            std = np.sqrt(self.shares @ (variances + (values - value) ** 2))
+        return value.reshape(at.shape[:-1]), std.reshape(at.shape[:-1])
+
+    def _by_tiles(self, at: FloatArray) -> FloatArray:
+        """(2, q) values and standard deviations at (q, 2) positions."""
+        found, points = np.empty((2, len(at))), cKDTree(self.xy_m)
+        low_m, side_m = at.min(axis=0), max(float(np.max(np.ptp(at, axis=0))), 1e-9) / _ALONG
+        tiles, tile_of = np.unique(np.floor((at - low_m) / side_m).astype(int), axis=0, return_inverse=True)
         for k in range(len(tiles)):
             own = tile_of.ravel() == k
-            _, near = points.query(flat[own].mean(axis=0), k=_NEIGHBOURS)
+            _, near = points.query(at[own].mean(axis=0), k=_NEIGHBOURS)
             known = self.xy_m[near], self.values[near], self.noise_std[near]
-            part = Process.of(*known, self.length_m, self.process_std, self.scatter)
-            found[:, own] = part.moments(flat[own])
-        value, variance = found.reshape(2, *at.shape[:-1])
-        return value, np.sqrt(variance)
-
-
-def krige_many(
-    xy_m: npt.ArrayLike, values: npt.ArrayLike, noise_std: npt.ArrayLike
-) -> KrigedSurface | TiledSurface:
-    """`krige` of any number of points; beyond `MOST_JOINT` of them tile by tile.
-
-    Length, size and scatter are those of all points.
-
-    Raises
-    ------
-    ValueError
-        As `krige`.
-    """
-    xy, y, noise = (np.asarray(v, float) for v in (xy_m, values, noise_std))
-    if len(xy) <= MOST_JOINT:
-        return krige(xy, y, noise)
-    _check_values(xy, y, noise)
-    extent = float(np.linalg.norm(np.ptp(xy, axis=0)))
-    require(extent > 0, "xy_m", "one place", "places apart from each other")
-    rounded = np.round(xy / (1e-9 * extent))
-    exact = rounded[noise == 0]
-    alone = len(np.unique(exact, axis=0)) == len(exact)
-    require(alone, "xy_m", "one place twice, without noise", "one exact value a place")
-    places = np.unique(rounded, axis=0) * (1e-9 * extent)
-    nearest = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
-    scale = _scale(y)
-    lowest, highest = np.log(0.3 * nearest), np.log(10 * extent)
-    best = _fitted(
-        xy,
-        y,
-        noise,
-        np.linspace(lowest, np.log(extent), 4)[1:3],
-        (lowest, highest),
-        (np.log(1e-4 * scale), np.log(100 * scale)),
-    )
-    return TiledSurface(xy, y, noise, *best.tolist())
+            found[:, own] = KrigedSurface(*known, self.constants, self.shares).predict(at[own])
+        return found
 
 
 def krige(
@@ -253,34 +207,31 @@ def krige(
     """
     xy, y, noise = (np.asarray(v, float) for v in (xy_m, values, noise_std))
     require(len(xy) >= LEAST_POINTS, "xy_m", len(xy), f"{LEAST_POINTS} points or more")
-    _check_values(xy, y, noise)
-    distances = cdist(xy, xy)
-    apart = distances + np.diag(np.full(len(xy), np.inf))
-    extent = float(distances.max())
-    require(extent > 0, "xy_m", "one place", "places apart from each other")
-    twice = (apart < 1e-9 * extent) & (noise[:, None] == 0) & (noise == 0)
-    require(not twice.any(), "xy_m", "one place twice, without noise", "one exact value a place")
-    scale = _scale(y)
-    other = np.where(apart < 1e-9 * extent, np.inf, apart)  # places, not points
-    nearest = float(np.median(other.min(axis=1)))
-    longest = min(10 * extent, most_length_m)
-    lowest, highest = np.log(min(0.3 * nearest, longest)), np.log(longest)
-    sizes = np.log(max(1e-4 * scale, least_std)), np.log(max(100 * scale, least_std))
-    if len(y) <= MIXED_POINTS:
-        lengths = lowest, max(lowest, min(highest, np.log(3 * extent)))
-        at, shares = _spread(lengths, sizes, distances, y, noise)
-    else:
-        starts = np.linspace(lowest, min(np.log(extent), highest), 4)[1:3]
-        at, shares = _fitted(xy, y, noise, starts, (lowest, highest), sizes)[None], np.ones(1)
-    processes = tuple(Process.of(xy, y, noise, *each) for each in at.tolist())
-    return KrigedSurface(processes, shares)
-
-
-def _check_values(xy: FloatArray, y: FloatArray, noise: FloatArray) -> None:
     good = bool(np.all(np.isfinite(xy)) and np.all(np.isfinite(y)))
     require(good, "xy_m, values", "some that are not finite", "finite numbers")
     wrong = noise[~((noise >= 0) & np.isfinite(noise))]
     require(not wrong.size, "noise_std", wrong.tolist()[:1], "finite numbers, 0 or above")
+    # of many points the diagonal of all: their distances would take too much memory
+    extent = float(np.linalg.norm(np.ptp(xy, axis=0)) if len(xy) > MOST_JOINT else pdist(xy).max())
+    require(extent > 0, "xy_m", "one place", "places apart from each other")
+    unit_m = 1e-9 * extent  # what is nearer is one place
+    places, place_of = np.unique(np.round(xy / unit_m), axis=0, return_inverse=True)
+    exact = place_of.ravel()[noise == 0]
+    alone = len(np.unique(exact)) == len(exact)
+    require(alone, "xy_m", "one place twice, without noise", "one exact value a place")
+    away = unit_m * cKDTree(places).query(places, k=2)[0][:, 1]
+    nearest = float(np.median(away[place_of.ravel()]))
+    scale, longest = _scale(y), min(10 * extent, most_length_m)
+    lowest, highest = np.log(min(0.3 * nearest, longest)), np.log(longest)
+    sizes = np.log(max(1e-4 * scale, least_std)), np.log(max(100 * scale, least_std))
+    if len(y) <= MIXED_POINTS:
+        lengths = lowest, max(lowest, min(highest, np.log(3 * extent)))
+        constants, shares = _spread(lengths, sizes, xy, y, noise)
+    else:
+        starts = np.linspace(lowest, min(np.log(extent), highest), 4)[1:3]
+        constants = _fitted(xy, y, noise, starts, (lowest, highest), sizes)[None]
+        shares = np.ones(1)
+    return KrigedSurface(xy, y, noise, constants, shares)
 
 
 def _scale(y: FloatArray) -> float:
@@ -335,7 +286,7 @@ def _fitted(
 def _spread(
     lengths: tuple[float, float],
     sizes: tuple[float, float],
-    distances: FloatArray,
+    xy: FloatArray,
     y: FloatArray,
     noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
@@ -344,7 +295,7 @@ def _spread(
     Bounds of length and size are logarithms. No scatter, and each that is looked for, are as probable
     beforehand.
     """
-    scale = _scale(y)
+    scale, distances = _scale(y), cdist(xy, xy)
     scatters = np.append(0.0, scale * _SCATTERS)
     looked_for = noise.all() & (scatters > _LEAST_SCATTER * np.median(noise))
     looked_for[0] = True

@@ -23,7 +23,7 @@ from scipy.special import ndtr, ndtri, owens_t
 
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import known, require
-from tactile_resonance.scan.kriging import KrigedSurface, TiledSurface
+from tactile_resonance.scan.kriging import KrigedSurface
 from tactile_resonance.scan.points import inside_polygon
 
 Lines = tuple[FloatArray, ...]
@@ -181,7 +181,7 @@ def difference_m2(
     return float(np.sum(wrong & raster.within)) * raster.cell_m2
 
 
-def boundary_of(surface: KrigedSurface | TiledSurface, level_set: LevelSet, raster: Raster) -> Boundary:
+def boundary_of(surface: KrigedSurface, level_set: LevelSet, raster: Raster) -> Boundary:
     """Boundary of what lies between two levels of a kriged quantity."""
     value, std = surface.predict(raster.xy_m)
     depth, reach = level_set.depth(value), float(ndtri((1 + PROBABILITY) / 2)) * std

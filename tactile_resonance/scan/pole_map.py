@@ -20,7 +20,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.poles.result import ellipse, ellipse_radius
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.adaptive import known_points
-from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, TiledSurface, krige_many
+from tactile_resonance.scan.kriging import LEAST_POINTS, KrigedSurface, krige
 from tactile_resonance.scan.level_set import Boundary, LevelSet, Raster, boundary_of
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.points import on_a_line
@@ -214,7 +214,7 @@ class PoleMap:
             for p in self.estimated
         ]
 
-    def krige(self) -> KrigedSurface | TiledSurface | None:
+    def krige(self) -> KrigedSurface | None:
         """Natural frequency over x, y; None where too few points have a covariance."""
         points = self.with_ellipse
         if len(points) < LEAST_POINTS:
@@ -222,7 +222,7 @@ class PoleMap:
         xy = np.array([p.position_m[:2] for p in points])
         if on_a_line(xy, SAME_PLACE_M):  # nothing is known beside it
             return None
-        return krige_many(xy, [p.result.f0_hz for p in points], [p.result.f0_std_hz for p in points])
+        return krige(xy, [p.result.f0_hz for p in points], [p.result.f0_std_hz for p in points])
 
     def boundary(self, level_set: LevelSet) -> Boundary | None:
         """Boundary of what lies between two natural frequencies about the points; None as of `krige`.
@@ -235,7 +235,7 @@ class PoleMap:
         low, high = xy.min(axis=0) - self.spacing_m / 2, xy.max(axis=0) + self.spacing_m / 2
         box = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
         raster = Raster.over(box, float(np.max(high - low)) / _CELLS)
-        return boundary_of(krige_many(xy, f0_hz, std_hz), level_set, raster)
+        return boundary_of(krige(xy, f0_hz, std_hz), level_set, raster)
 
     def surface(self, cells: int = 40) -> MapSurface | None:
         """Kriged natural frequency on a grid over the points, `cells` along its longer side."""

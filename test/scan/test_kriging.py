@@ -4,12 +4,8 @@
 import numpy as np
 import pytest
 
-from tactile_resonance.scan.kriging import (
-    MIXED_POINTS,
-    TiledSurface,
-    krige,
-    krige_many,
-)
+from tactile_resonance.scan import kriging
+from tactile_resonance.scan.kriging import MIXED_POINTS, krige
 
 
 def matern(distance, length):
@@ -100,7 +96,7 @@ def test_what_scatters_from_place_to_place_is_in_the_band(side, runs, least):
         off = np.sum((np.concatenate([grid, at]) - middle) ** 2, axis=1)
         truth = 254 + 3 * np.exp(-off / (2 * width**2)) + 0.2 * rng.standard_normal(n + 50)
         noise = np.full(n, 0.02)
-        value, std = krige_many(grid, truth[:n] + noise * rng.standard_normal(n), noise).predict(at)
+        value, std = krige(grid, truth[:n] + noise * rng.standard_normal(n), noise).predict(at)
         within.append(np.mean(np.abs(value - truth[n:]) < 1.96 * std))
     assert least < np.mean(within) < 0.99
 
@@ -231,16 +227,17 @@ def test_length_and_size_stay_within_what_is_known_beforehand():
     assert flat.predict([[0.1, 0.1]])[1] >= 1.0
 
 
-def test_of_many_points_tiles_predict_what_all_points_together_do():
+def test_of_many_points_tiles_predict_what_all_points_together_do(monkeypatch):
     """On the same length and size: the neighbours of a tile screen what is farther away."""
     rng = np.random.default_rng(5)
     xy = rng.uniform(0, 0.05, (1200, 2))
     noise = np.full(len(xy), 0.05)
     y = 250 + np.sin(200 * xy[:, 0]) * np.cos(150 * xy[:, 1]) + noise * rng.standard_normal(len(xy))
     at = rng.uniform(0.002, 0.048, (400, 2))
-    tiled = krige_many(xy, y, noise)
-    assert isinstance(tiled, TiledSurface)
-    (value, std), (together, std_together) = tiled.predict(at), krige(xy, y, noise).predict(at)
+    surface = krige(xy, y, noise)
+    value, std = surface.predict(at)
+    monkeypatch.setattr(kriging, "MOST_JOINT", len(xy))
+    together, std_together = surface.predict(at)
     truth = 250 + np.sin(200 * at[:, 0]) * np.cos(150 * at[:, 1])
     assert np.sqrt(np.mean((value - together) ** 2)) < 0.2 * np.median(std_together)
     assert 0.8 < np.median(std / std_together) < 1.4
@@ -260,9 +257,9 @@ def test_something_small_in_a_large_map_is_neither_smoothed_away_nor_sure(count)
 
     noise = np.full(len(xy), 0.05)
     at = middle + rng.uniform(-0.003, 0.003, (200, 2))
-    value, std = krige_many(xy, truth(xy) + noise * rng.standard_normal(len(xy)), noise).predict(at)
+    value, std = krige(xy, truth(xy) + noise * rng.standard_normal(len(xy)), noise).predict(at)
     off = value - truth(at)
     assert np.max(np.abs(off)) < 0.6
     assert np.sqrt(np.mean((off / std) ** 2)) < 3
     with pytest.raises(ValueError, match="one place twice"):
-        krige_many(np.concatenate([xy, xy[:1]]), truth(np.concatenate([xy, xy[:1]])), np.zeros(len(xy) + 1))
+        krige(np.concatenate([xy, xy[:1]]), truth(np.concatenate([xy, xy[:1]])), np.zeros(len(xy) + 1))
