@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractContextManager
+from dataclasses import asdict, fields
 from typing import Any
 
 from rclpy.action.server import ServerGoalHandle
@@ -16,7 +17,6 @@ from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_threa
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.goal import ScanGoal
 from tactile_resonance.scan.hands import Controls, Progress, Request, Summary
-from tactile_resonance.scan.point_outcome import SensorHealth
 from tactile_resonance.scan.table_calibration import (
     NOT_ESTIMATED,
     CalibrationRequest,
@@ -24,17 +24,6 @@ from tactile_resonance.scan.table_calibration import (
 )
 
 RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
-
-# Fields of equal name in message and object.
-SCAN_OPTIONS = (
-    *("scene", "force_n", "f0_std_hz", "damping_ratio_std"),
-    *("run_directory", "resume", "seed", "notes"),
-)
-SUMMARY = ("message", "done", "failed", "skipped", "blocks", "blocks_saved", "saved_s", "repeats")
-CALIBRATION_OPTIONS = (
-    *("force_n", "search_m", "flatness_m", "most_tilt_rad"),
-    *("heading_rad", "sensor", "file"),
-)
 
 
 class OneGoal:
@@ -165,8 +154,8 @@ def scan_goal(message: Scan.Goal) -> ScanGoal:
         + (p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w)
         for p in message.poses.poses
     )
-    given = {name: getattr(message, name) for name in SCAN_OPTIONS}
-    return ScanGoal(poses=poses, frame_id=message.poses.header.frame_id, **given)
+    given = {each.name: getattr(message, each.name, None) for each in fields(ScanGoal)}
+    return ScanGoal(**{**given, "poses": poses, "frame_id": message.poses.header.frame_id})
 
 
 def scan_feedback(progress: Progress, run_directory: str) -> Scan.Feedback:
@@ -190,16 +179,16 @@ def scan_feedback(progress: Progress, run_directory: str) -> Scan.Feedback:
 
 def fill_scan_result(result: Scan.Result, summary: Summary) -> None:
     """Write how a scan ended."""
-    result.outcome = Scan.Result.COMPLETE if summary.complete else Scan.Result.ENDED
-    for name in SUMMARY:
-        setattr(result, name, getattr(summary, name))
-    result.sensor_drifted = summary.health is SensorHealth.DRIFTED
-    result.sensor_health = summary.health_sentence
+    told = asdict(summary)
+    result.outcome = Scan.Result.COMPLETE if told.pop("complete") else Scan.Result.ENDED
+    for name, value in told.items():
+        setattr(result, name, value)
 
 
 def calibration_request(message: CalibrateTable.Goal) -> CalibrationRequest:
     """What a goal asks for; ValueError where it is wrong."""
-    given = {name: value for name in CALIBRATION_OPTIONS if (value := getattr(message, name))}
+    names = [each.name for each in fields(CalibrationRequest) if each.name != "points_m"]
+    given = {name: value for name in names if (value := getattr(message, name))}
     points = tuple((point.x, point.y, point.z) for point in message.points)
     return CalibrationRequest(points, **given)
 

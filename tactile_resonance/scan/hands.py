@@ -19,7 +19,6 @@ if TYPE_CHECKING:  # nodes that take goals need what may go wrong, and load noth
     from tactile_resonance.record import Origin
     from tactile_resonance.scan.clearance import Standoffs
     from tactile_resonance.scan.measurement import MeasurementDesign
-    from tactile_resonance.scan.point_outcome import SensorHealth
     from tactile_resonance.scan.points import ScanPoint
     from tactile_resonance.scan.run_directory import PointRecording
     from tactile_resonance.scan.tissue_tests import ProtocolRequest
@@ -295,24 +294,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Summary:
-    """How a scan ended.
-
-    Attributes
-    ----------
-    complete : bool
-        Every point of the plan is finished.
-    message : str
-    done, failed, skipped : int
-        Points by their latest outcome.
-    blocks, blocks_saved : int
-    saved_s : float
-        Measuring time saved by ending points early.
-    repeats : int
-        Attempts that were disturbed and repeated.
-    health : SensorHealth
-    health_sentence : str
-        What the references in air say of the sensor.
-    """
+    """How a scan ended: `complete` with every point finished; other fields are those of the action's result."""
 
     complete: bool
     message: str
@@ -323,8 +305,8 @@ class Summary:
     blocks_saved: int
     saved_s: float
     repeats: int
-    health: SensorHealth
-    health_sentence: str
+    sensor_drifted: bool
+    sensor_health: str
 
 
 class Request(Enum):

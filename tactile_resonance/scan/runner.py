@@ -36,6 +36,7 @@ from tactile_resonance.scan.point_outcome import (
     AFTER,
     BEFORE,
     SILENT,
+    SensorHealth,
     air_point,
     attempt_at,
     measured_result,
@@ -434,8 +435,8 @@ class ScanRunner:
             blocks_saved=sum(result.blocks_saved for result in latest),
             saved_s=float(np.nansum([result.saved_s for result in latest])),
             repeats=self._repeats(),
-            health=health,
-            health_sentence=sentence,
+            sensor_drifted=health is SensorHealth.DRIFTED,
+            sensor_health=sentence,
         )
 
 
