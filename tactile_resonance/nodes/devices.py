@@ -243,7 +243,13 @@ class BenchDevice(AcquisitionDevice):
     def read_block(self, timeout_s: float) -> AcquiredBlock:
         """Next block of what is armed; blocks of what was stopped before are passed over."""
         if self._armed is not None and self._clock is not None:
-            self._wait_for_time(self._clock, self._armed)
+            # time goes on to the end of the next block, and stands there until the one after
+            end_ns = self._start_ns + round((self._next_index + 1) * self._armed.period_s * 1e9)
+            try:
+                self._clock.wait_until(end_ns)
+            except ClockLostError as error:
+                self._check()
+                raise DeviceError(f"device: {error}") from error
             timeout_s = self._answer_s
         deadline = time.monotonic() + timeout_s
         while True:
@@ -282,15 +288,6 @@ class BenchDevice(AcquisitionDevice):
     def _check(self) -> None:
         if self._interrupted:
             raise DeviceError("device: interrupted")
-
-    def _wait_for_time(self, clock: SimulatedClock, armed: Excitation) -> None:
-        """Let simulated time go on to the end of the next block; it stands there until the one after."""
-        end_ns = self._start_ns + round((self._next_index + 1) * armed.period_s * 1e9)
-        try:
-            clock.wait_until(end_ns)
-        except ClockLostError as error:
-            self._check()
-            raise DeviceError(f"device: {error}") from error
 
     def _call(self, client: Client, request: object) -> Any:
         """Answer of the bench, asked from a worker thread while the executor's thread spins."""

@@ -292,16 +292,13 @@ class FakeHardwareNode(ManagedNode):
         except (ValueError, ClockLostError) as error:
             response.message = str(error)
             return response
-        self._say_effort(run, excitation)
-        response.accepted, response.start = True, time_message(start_ns)
-        self._played = asked, response
-        return response
-
-    def _say_effort(self, run: BenchRun, excitation: Excitation) -> None:
         effort = run.effort(excitation)
         if effort.lines != self._said_lines:
             self._said_lines = effort.lines
             self.get_logger().info(str(effort))
+        response.accepted, response.start = True, time_message(start_ns)
+        self._played = asked, response
+        return response
 
     def _on_truth(self, request: Truth.Request, response: Truth.Response) -> Truth.Response:
         place = request.position

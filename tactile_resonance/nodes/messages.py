@@ -169,8 +169,17 @@ def frf_to_message(frf: FRF, origin: Origin, level_v: float, saturated: bool) ->
     _write_origin(message, origin)
     write_values(message, (*FRF_EQUAL, "frequency_hz", *FRF_OPTIONAL), frf)
     fill_complex(message, "", frf.g)
-    if frf.bins is not None:
-        _write_bins(message, (frf.bins, *frf.further_bins))
+    if (first := frf.bins) is not None:
+        for bins in (first, *frf.further_bins):
+            fill_complex(message, "bins_actuator_", bins.u)
+            fill_complex(message, "bins_sensor_", bins.y)
+            fill(message.bins_harmonics, bins.harmonics)
+        message.bins_first = first.first_bin
+        fill(message.further_bins_first, [bins.first_bin for bins in frf.further_bins])
+        fill(message.further_bins_count, [bins.count for bins in frf.further_bins])
+        message.bins_sample_rate_hz = first.sample_rate_hz
+        message.bins_samples_per_period = first.samples_per_period
+        message.bins_periods = first.periods
     return message
 
 
@@ -194,21 +203,6 @@ def frf_from_message(message: msg.FRF) -> tuple[FRF, Origin]:
         status=key_of(FRF_STATUS, message.status, "status"),
     )
     return frf, origin_from_message(message)
-
-
-def _write_bins(message: msg.FRF, bands: Sequence[BandBins]) -> None:
-    """Of one record in several bands."""
-    first, further = bands[0], bands[1:]
-    for bins in bands:
-        fill_complex(message, "bins_actuator_", bins.u)
-        fill_complex(message, "bins_sensor_", bins.y)
-        fill(message.bins_harmonics, bins.harmonics)
-    message.bins_first = first.first_bin
-    fill(message.further_bins_first, [bins.first_bin for bins in further])
-    fill(message.further_bins_count, [bins.count for bins in further])
-    message.bins_sample_rate_hz = first.sample_rate_hz
-    message.bins_samples_per_period = first.samples_per_period
-    message.bins_periods = first.periods
 
 
 def _bins(message: msg.FRF) -> tuple[BandBins, ...]:

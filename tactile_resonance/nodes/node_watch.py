@@ -179,7 +179,8 @@ class NodeWatch:
         """Whether all that is missing was deactivated: nodes that come up are so only for a moment."""
         for topic in self._topics:
             nodes = self._publishers(topic)
-            if all(map(self._problem, nodes)) and not any(map(self._deactivated, nodes)):
+            inactive = (node for node in nodes if self._sign(node).state == "inactive")
+            if all(map(self._problem, nodes)) and all(map(self._silence, inactive)):
                 return False
         return True
 
@@ -229,9 +230,6 @@ class NodeWatch:
             for name, sign in list(self._signs.items()):
                 self._signs[name] = _Sign(DOUBTED, sign.instance, sign.heard_s)
             raise
-
-    def _deactivated(self, node: str) -> bool:
-        return self._sign(node).state == "inactive" and not self._silence(node)
 
     def _problem(self, node: str) -> str:
         """Why a node is not at work; empty where it is."""

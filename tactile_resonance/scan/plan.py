@@ -128,11 +128,10 @@ class Plan:
         """About what these take [s]."""
         return self.touches_before * CONTACT_S
 
-    def duration_s(self, blocks: int, points: int | None = None) -> float:
-        """Of so many points, by default the most, with so many blocks each, and with the longest tests [s]."""
-        count = self.most_points if points is None else points
-        tests_s = sum(asked.longest_s * _tested(asked, count) for asked in self.scene.protocols)
-        return count * self.point_s(blocks) + tests_s
+    def duration_s(self, blocks: int) -> float:
+        """Of the most points, with so many blocks each, and with the longest tests [s]."""
+        tests_s = sum(asked.longest_s * _tested(asked, self.most_points) for asked in self.scene.protocols)
+        return self.most_points * self.point_s(blocks) + tests_s
 
     def point_s(self, blocks: int) -> float:
         """Mean time of a point with so many blocks, without its tests [s].

@@ -68,7 +68,7 @@ def run_entries(run: RunContent) -> list[StoredEntry]:
     return [
         StoredEntry(key, path, partial(_read, path, key), _place_of(path))
         for path in run.paths()
-        for key in _ids_of(path)
+        for key in dict.fromkeys(int(m.measurement_id) for _, _, m in read_messages(path, EXCITATION))
     ]
 
 
@@ -164,9 +164,3 @@ def measurements_of_file(path: Path) -> Iterator[StoredMeasurement]:
             problems[message.measurement_id].append(f"{path.name}: {error}")
     for key in dict.fromkeys([*excitations, *records, *problems]):
         yield StoredMeasurement.of(key, excitations[key], records[key], problems[key])
-
-
-def _ids_of(path: Path) -> list[int]:
-    """Measurements of a file, by its excitations."""
-    messages = read_messages(path, EXCITATION)
-    return list(dict.fromkeys(int(excitation.measurement_id) for _, _, excitation in messages))

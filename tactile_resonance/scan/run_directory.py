@@ -198,7 +198,8 @@ class RunDirectory:
                 raise ValueError(
                     f"run: {path}: {changed[0]}; accepted is the scene with which the run began"
                 )
-            if other := _other_definitions(content):
+            told = {(each.type_name, each.type_hash) for file in content.files for each in file.topics}
+            if other := sorted(name for name, own in told if definition_and_hash(name)[1] != own):
                 raise ValueError(
                     f"run: {path} was recorded by a version with other definitions of {', '.join(other)}; "
                     "accepted is that version (report and analyze take the run as it is)"
@@ -385,12 +386,6 @@ def _plan_text(content: RunContent) -> bytes:
         plan["places"] = [asdict(point) for point in content.places]
     plan[CHECKSUM] = checksum_of(plan)
     return (json.dumps(plan, indent=1, allow_nan=False) + "\n").encode()
-
-
-def _other_definitions(content: RunContent) -> list[str]:
-    """Types of a run whose messages are defined in another way today."""
-    hashes = {(topic.type_name, topic.type_hash) for file in content.files for topic in file.topics}
-    return sorted(name for name, of_run in hashes if definition_and_hash(name)[1] != of_run)
 
 
 def _mend_index(path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -224,7 +224,10 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
         scene = read_run_scene(run.path / "scene.yaml")
         _require_force(scene, hands.free_air)
         _require_tests(scene, hands)
-        scene = _placed(scene, replace(frames, others=_frames_of(facts, scene, frames)), hands)
+        # of an earlier version every scene's frame was the table
+        stood = facts.get("frames", {scene.frame_id: frames.table_in_base.vector})
+        others = {name: Pose.from_vector(vector) for name, vector in stood.items()}
+        scene = _placed(scene, replace(frames, others=others), hands)
         points = run.content.places or run.content.points
         return plan_points(scene, points), run, int(facts["seed"])
     except BaseException:
@@ -257,14 +260,6 @@ def _require_tests(scene: ScanScene, hands: Hands) -> None:
     asked = [str(each) for each in scene.protocols]
     accepted = "none where no node offers the action indent: ideal contact does not"
     require(not asked or hands.offers_tests(), "protocols", asked, accepted)
-
-
-def _frames_of(facts: Mapping[str, Any], scene: ScanScene, frames: Frames) -> dict[str, Pose]:
-    """Other frames in the base, as they stood when a run began."""
-    noted = facts.get("frames")
-    if noted is None:  # of an earlier version, where every scene's frame was the table
-        return {scene.frame_id: frames.table_in_base}
-    return {name: Pose.from_vector(vector) for name, vector in noted.items()}
 
 
 def run_facts(plan: Plan, seed: int) -> dict[str, Any]:
