@@ -135,20 +135,8 @@ def _nominal(run: RunContent) -> tuple[float, float] | None:
 
 def _difference(first: PointResult, other: PointResult, one_contact: bool) -> Difference:
     nominal = one_contact and all(np.isfinite(r.nominal_f0_std_hz) for r in (first, other))
-    (x, p), (y, q) = (_pole(r, nominal) for r in (first, other))
+    (x, p), (y, q) = (r.pole("nominal_" if nominal else "") for r in (first, other))
     return Difference(first, other, y - x, p + q, nominal)
-
-
-def _pole(result: PointResult, nominal: bool) -> tuple[FloatArray, FloatArray]:
-    """(2,) f0 [Hz] and damping ratio, and their covariance (2, 2)."""
-    if not nominal:
-        return result.estimate, result.covariance
-    cross = result.nominal_f0_damping_covariance_hz
-    covariance = [
-        [result.nominal_f0_std_hz**2, cross],
-        [cross, result.nominal_damping_ratio_std**2],
-    ]
-    return np.array([result.nominal_f0_hz, result.nominal_damping_ratio]), np.array(covariance)
 
 
 def sentence(name: str, first: str, found: Sequence[Difference], apart: Sequence[str] = ()) -> str:

@@ -31,6 +31,8 @@ POLES_TYPE = "tactile_resonance/msg/Poles"
 RESULTS_DEPTH = 4096  # of the nodes that publish them
 RESULTS = "results.csv"
 NAN = float("nan")
+MODE = ("f0_hz", "f0_std_hz", "damping_ratio", "damping_ratio_std", "f0_damping_covariance_hz")
+"""Fields of one mode, of a point and of a band."""
 
 
 class PointOutcome(IntEnum):
@@ -179,8 +181,12 @@ class PointResult:
     @property
     def covariance(self) -> FloatArray:
         """(2, 2) of f0 [Hz] and damping ratio; NaN where unknown."""
-        cross = self.f0_damping_covariance_hz
-        return np.array([[self.f0_std_hz**2, cross], [cross, self.damping_ratio_std**2]])
+        return self.pole()[1]
+
+    def pole(self, prefix: str = "") -> tuple[FloatArray, FloatArray]:
+        """`estimate` and `covariance`; with ``nominal_`` those at the nominal contact."""
+        f0_hz, f0_std_hz, damping, damping_std, cross = (getattr(self, prefix + name) for name in MODE)
+        return np.array([f0_hz, damping]), np.array([[f0_std_hz**2, cross], [cross, damping_std**2]])
 
 
 _OF_BANDS = ("distortion", "further")
@@ -255,14 +261,8 @@ def mode_columns(estimate: FloatArray, covariance: FloatArray, prefix: str = "")
         Of the names.
     """
     f0_std_hz, damping_ratio_std = np.sqrt(np.diag(covariance))
-    columns = {
-        "f0_hz": float(estimate[0]),
-        "f0_std_hz": float(f0_std_hz),
-        "damping_ratio": float(estimate[1]),
-        "damping_ratio_std": float(damping_ratio_std),
-        "f0_damping_covariance_hz": float(covariance[0, 1]),
-    }
-    return {prefix + name: value for name, value in columns.items()}
+    values = (estimate[0], f0_std_hz, estimate[1], damping_ratio_std, covariance[0, 1])
+    return {prefix + name: float(value) for name, value in zip(MODE, values, strict=True)}
 
 
 def band_results(poles: Poles) -> tuple[BandResult, ...]:

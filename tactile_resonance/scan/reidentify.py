@@ -26,7 +26,7 @@ import numpy.typing as npt
 from tactile_resonance._typing import BoolArray
 from tactile_resonance.fields import read_dataclass, read_yaml, section
 from tactile_resonance.poles.estimator import identify_poles_from_bins
-from tactile_resonance.poles.joint import JointPlan, PoleEstimator
+from tactile_resonance.poles.joint import PoleEstimator
 from tactile_resonance.poles.result import STATUS_CODE, STATUSES, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.scan.kept_bins import (
@@ -38,6 +38,7 @@ from tactile_resonance.scan.kept_bins import (
     whole_npz,
     write_array,
 )
+from tactile_resonance.scan.point_result import MODE
 from tactile_resonance.scan.run_content import read_plan
 from tactile_resonance.scan.scene import SensorUse
 
@@ -46,15 +47,7 @@ STATUS = "poles_status"
 _AHEAD = 2
 # A fit of these found nothing that another one could explain.
 _SURE = (PolesStatus.OK, PolesStatus.NO_COVARIANCE)
-_MODE = (
-    "f0_hz",
-    "f0_std_hz",
-    "damping_ratio",
-    "damping_ratio_std",
-    "f0_damping_covariance_hz",
-    "pole_real_rad_s",
-    "pole_imag_rad_s",
-)
+_MODE = (*MODE, "pole_real_rad_s", "pole_imag_rad_s")
 _COSTS = ("cost", "expected_cost")
 _STATUSES = [status.value for status in STATUSES]
 
@@ -180,8 +173,8 @@ def reidentify(
 
 
 @lru_cache(maxsize=32)
-def _plan(kind: BinsKind, band_hz: tuple[float, float], structure: ModelStructure) -> JointPlan:
-    return (JointPlan if kind.realisations == 1 else PoleEstimator)(
+def _plan(kind: BinsKind, band_hz: tuple[float, float], structure: ModelStructure) -> PoleEstimator:
+    return PoleEstimator(
         kind.sample_rate_hz,
         kind.samples_per_period,
         kind.periods,
@@ -200,7 +193,7 @@ def _identified(job: tuple) -> tuple[npt.NDArray, str]:
     first = plan.bins[0] - kind.first_bin
     here = slice(first, first + plan.bins.size)
     u, y = (points[name][..., here].astype(complex) for name in ("u", "y"))  # (n, M, K)
-    batch = plan.from_bins(u[:, 0], y[:, 0]) if kind.realisations == 1 else plan.from_bins(u, y)
+    batch = plan.from_bins(u, y)
     rows = np.zeros(points.size, dtype)
     rows["run"] = run
     for name in PLACE:
