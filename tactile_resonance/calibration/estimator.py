@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
+from scipy import optimize, special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.calibration.contact import (
@@ -48,11 +48,10 @@ FEWEST_BETWEEN = 30
 LOUDEST = 9.0
 """Of the noise of the calibration, as power: what is more than that between lines is a transient that does not
 fit, as of another sensor, and must not widen the deviations until nothing contradicts the calibration."""
-_STEPS = 300
-_LONGEST = 0.2
-"""Of a step in any parameter, logarithms and an exponent: first steps overshoot, and a power law that leaves
-its exponents stays there."""
-_ENOUGH = 1e-3  # of the weighted squares: a thirtieth of a deviation
+_STEPS, _FIRST_STEP = 300, 0.2
+"""Of the fit; the first one in logarithms and an exponent: it would overshoot, and a power law that leaves its
+exponents stays there."""
+_ENOUGH = 1e-7  # by which the weighted squares fall
 _NEAR = (0.2, 5.0)
 """Of the ends of the band: poles between them have a state of their own where that at the start is unknown."""
 FEWEST_LINES = 3
@@ -285,7 +284,7 @@ class _Fit:
         return out
 
     def solved(self, p: FloatArray) -> tuple[FloatArray, bool]:
-        """Levenberg and Marquardt; the level of the noise from bins between lines where there are enough."""
+        """Least squares; the level of the noise from bins between lines where there are enough."""
         p, converged = self._descend(p)
         between = ~self._excited
         if np.count_nonzero(between) - self.directions / 2 < FEWEST_BETWEEN:
@@ -297,26 +296,16 @@ class _Fit:
         return self._descend(p)
 
     def _descend(self, p: FloatArray) -> tuple[FloatArray, bool]:
-        residual, damping = self.residual(p), 1e-3
-        cost = residual @ residual
-        for _ in range(_STEPS):
-            jacobian = slope_of(self.residual, p)
-            normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
-            while damping < 1e9:
-                step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
-                step *= min(1.0, _LONGEST / np.abs(step).max())
-                tried = self.residual(p + step)
-                if tried @ tried <= cost:
-                    break
-                damping *= 10
-            else:
-                return p, True  # no step makes it better: at the minimum to within rounding
-            gained = cost - tried @ tried
-            p, residual, cost = p + step, tried, tried @ tried
-            damping = max(damping / 10, 1e-9)
-            if gained < _ENOUGH:
-                return p, True
-        return p, False
+        found = optimize.least_squares(  # of a way from 0 its first step is as long as the scale
+            lambda way: self.residual(p + way),
+            np.zeros(p.size),
+            lambda way: slope_of(self.residual, p + way),
+            method="dogbox",
+            x_scale=_FIRST_STEP,
+            ftol=_ENOUGH,
+            max_nfev=_STEPS,
+        )
+        return p + found.x, found.status > 0
 
     def result(self, p: FloatArray, converged: bool) -> TissueContact:
         """Covariances, pole, judgement."""
