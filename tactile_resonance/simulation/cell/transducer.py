@@ -176,6 +176,8 @@ class Transducer:
     parameters : CellParameters
     seed : int
         Of the noise.
+    period_s : float
+        From one conversion to the next [s].
 
     Attributes
     ----------
@@ -183,7 +185,9 @@ class Transducer:
         Its fields may be set at any time.
     """
 
-    def __init__(self, parameters: CellParameters, seed: Seed = 1) -> None:
+    def __init__(
+        self, parameters: CellParameters, seed: Seed = 1, *, period_s: float = SAMPLE_PERIOD_S
+    ) -> None:
         self.parameters = parameters
         self.faults = CellFaults()
         p = parameters
@@ -191,15 +195,15 @@ class Transducer:
         self._axes = np.zeros(6, AXES)
         self._axes["range"] = [p.force_range_n] * 3 + [p.torque_range_nm] * 3
         self._axes["divisor"] = [p.force_divisor] * 3 + [p.torque_divisor] * 3
-        self._axes["drift"] = [p.force_drift_n_per_s * SAMPLE_PERIOD_S] * 3 + [0.0] * 3
+        self._axes["drift"] = [p.force_drift_n_per_s * period_s] * 3 + [0.0] * 3
         self._axes["offset"] = [*p.force_bias_n, *p.torque_bias_nm]
         self._read = False  # whether there is a reading
-        self._keep = 0.0  # of the low-pass, off
+        self._period_s, self._keep = period_s, 0.0  # of the low-pass, off
         self.reseed(seed)
 
     def set_low_pass(self, corner_hz: float) -> None:
         """Set the corner of the first-order low-pass [Hz]; 0: off."""
-        self._keep = math.exp(-2 * math.pi * corner_hz * SAMPLE_PERIOD_S) if corner_hz > 0 else 0.0
+        self._keep = math.exp(-2 * math.pi * corner_hz * self._period_s) if corner_hz > 0 else 0.0
 
     def reseed(self, seed: Seed) -> None:
         """Take all noise from the next conversion on from a seed, that in the filter's memory too."""

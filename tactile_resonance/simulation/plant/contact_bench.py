@@ -284,7 +284,7 @@ class VirtualCell(Transducer):
         seed: int = 0,
     ) -> None:
         p = CellParameters.from_yaml() if parameters is None else parameters
-        super().__init__(p, seed)
+        super().__init__(p, seed, period_s=bench.motion.period_s)
         self.error: ForceFault | None = None
         self._bench, self.mounting = bench, mounting
         self._scale = np.repeat([1 / p.force_divisor, 1 / p.torque_divisor], 3)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.noise import Jitter
 from tactile_resonance.simulation.plant.contact_bench import ContactBench, TipMotion
 from tactile_resonance.simulation.plant.surfaces import FlatSurface
@@ -89,6 +90,19 @@ def test_noise_of_the_cell_is_not_what_shakes_the_arm(seed):
         with_lag = np.roll(noise, lag, axis=0)
         r = np.sum(driven * with_lag, axis=0) / np.sqrt(np.sum(driven**2, 0) * np.sum(noise**2, 0))
         assert np.abs(r).max() < 5 * np.sqrt(1.5 / count)
+
+
+def test_bias_of_the_cell_drifts_by_the_stated_rate_whatever_its_period():
+    drifting = CellParameters("drifts", 1e4, 1e4, 0.0, 0.0, 5.0, 0.3, force_drift_n_per_s=0.2)
+    for period_s in (0.001, 0.002, 0.004):
+        rig = ContactBench(
+            SOFT, FlatSurface.tilted(0.0, 0.0), START, cell_parameters=drifting, period_s=period_s
+        )
+        rig.clock.wait_until(1_004_000_000)
+        samples = rig.cell.read()
+        first, last = samples[0], samples[-1]
+        elapsed_s = (last.time_ns - first.time_ns) * 1e-9
+        assert last.wrench[2] - first.wrench[2] == pytest.approx(0.2 * elapsed_s, abs=2e-4)
 
 
 def test_bad_parameters_are_named():
