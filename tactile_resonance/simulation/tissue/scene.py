@@ -9,6 +9,7 @@ statically admissible), hence it never overstates what a stiff inclusion does.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -210,7 +211,9 @@ def energy_nodes() -> tuple[FloatArray, FloatArray]:
     return points, weights / weights.sum()
 
 
-def energy_share(shape: Shape, surface_point_m: ArrayLike, contact_radius_m: float) -> float:
+def energy_share(
+    shape: Shape, surface_point_m: ArrayLike, contact_radius_m: float, but: Sequence[Shape] = ()
+) -> float:
     """Return the share of the strain energy that lies inside a shape, 0 to 1.
 
     Parameters
@@ -219,10 +222,18 @@ def energy_share(shape: Shape, surface_point_m: ArrayLike, contact_radius_m: flo
     surface_point_m : (3,) array
         Where the tip touches; the normal is +z.
     contact_radius_m : float
+    but : sequence of Shape
+        What lies inside one of these, too, does not count.
     """
     points, weights = energy_nodes()
     at_m = np.asarray(surface_point_m)
-    inside = [shape.contains(at_m + contact_radius_m * part) for part in points]
+    inside = []
+    for part in points:
+        place_m = at_m + contact_radius_m * part
+        here = shape.contains(place_m)
+        for other in but:
+            here = here & ~other.contains(place_m)
+        inside.append(here)
     return float(weights[np.array(inside)].sum())
 
 
@@ -237,31 +248,36 @@ class Region:
 
 @dataclass(frozen=True)
 class Buried:
-    """Something under the surface: an inclusion, the layer below a layer.
-
-    The tip feels it as far as the stresses of its contact reach: with the share f of the strain
-    energy inside the shape (`energy_share`), ``1/E = (1 - f)/E_region + f/E_buried``, and Prony
-    ratios at f between the two. Exact to first order in the contrast, otherwise less than the truth
-    for what is stiffer. The contact radius is that of the tip on the region alone.
-
-    Attributes
-    ----------
-    name : str
-    shape : Shape
-    tissue : Tissue
-    """
+    """Something under the surface: an inclusion, the layer below a layer."""
 
     name: str
     shape: Shape
     tissue: Tissue
 
-    def felt_at(self, surface_point_m: FloatArray, above: Tissue, radius_m: float) -> Tissue:
-        """Return what the tip feels at a point (3,) of the surface where `above` lies."""
-        share = energy_share(self.shape, surface_point_m, radius_m)
-        if share == 0:
-            return above
-        low, high = above.relaxation_modulus_1s_pa, self.tissue.relaxation_modulus_1s_pa
-        return mixture(above, self.tissue, share, 1 / ((1 - share) / low + share / high))
+
+def felt_at(
+    surface_point_m: FloatArray, above: Tissue, buried: Sequence[Buried], radius_m: float
+) -> Tissue:
+    """Return what the tip feels at a point (3,) of the surface where `above` lies.
+
+    It feels what is buried as far as the stresses of its contact reach: with the shares f_i of the strain
+    energy inside each (`energy_share`; where they overlap, the later one is there),
+    ``1/E = (1 - sum f_i)/E_above + sum f_i/E_i``, and Prony ratios by the same shares. Exact to first order in
+    the contrast, otherwise less than the truth for what is stiffer. The contact radius is that of the tip on
+    `above` alone.
+    """
+    shapes = [each.shape for each in buried]
+    shares = [
+        energy_share(shape, surface_point_m, radius_m, shapes[n:]) for n, shape in enumerate(shapes, 1)
+    ]
+    felt, so_far = above, 1 - sum(shares)
+    for each, part in zip(buried, shares, strict=True):
+        so_far += part
+        if part:
+            share = min(1.0, part / so_far)
+            low, high = felt.relaxation_modulus_1s_pa, each.tissue.relaxation_modulus_1s_pa
+            felt = mixture(felt, each.tissue, share, 1 / ((1 - share) / low + share / high))
+    return felt
 
 
 @dataclass(frozen=True)
@@ -275,7 +291,7 @@ class PhantomScene:
         Contact force asked for [N].
     regions : tuple of Region
     buried : tuple of Buried
-        Felt from the surface of whatever region is there.
+        Felt from the surface of whatever region is there (`felt_at`).
     motion : SurfaceMotion or None
         How the surface moves along its normal; None: it is at rest.
     tip_radius_m, poisson_ratio : float
@@ -314,12 +330,10 @@ class PhantomScene:
         position[: given.size] = given
         tissue = self.regions[index].material(position)
         position[2] = 0.0
-        for buried in self.buried:
-            # Hertz contact of the preload, as in `hertz_contact`
-            plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - self.poisson_ratio**2)
-            radius = (0.75 * self.force_n * self.tip_radius_m / plane_modulus) ** (1 / 3)
-            tissue = buried.felt_at(position, tissue, radius)
-        return tissue
+        # Hertz contact of the preload, as in `hertz_contact`
+        plane_modulus = tissue.relaxation_modulus_1s_pa / (1 - self.poisson_ratio**2)
+        radius = (0.75 * self.force_n * self.tip_radius_m / plane_modulus) ** (1 / 3)
+        return felt_at(position, tissue, self.buried, radius)
 
 
 def read_scene(library: TissueLibrary, path: Path | None = None) -> PhantomScene:

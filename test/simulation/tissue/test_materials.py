@@ -32,6 +32,7 @@ from tactile_resonance.simulation.tissue.scene import (
     Sphere,
     energy_density,
     energy_share,
+    felt_at,
     hertz_stress,
     read_scene,
 )
@@ -110,7 +111,7 @@ def test_a_layer_on_a_rigid_base_is_felt_no_stiffer_than_it_is(library, depth):
     soft = library["gel10"]
     rigid = mixture(soft, library["gel12"], 0.5, 1e12)
     base = Buried("table", HalfSpace((0.0, 0.0, -depth), (0.0, 0.0, 1.0)), rigid)
-    felt = base.felt_at(np.zeros(3), soft, 1.0).relaxation_modulus_1s_pa
+    felt = felt_at(np.zeros(3), soft, [base], 1.0).relaxation_modulus_1s_pa
     truth = layer_share(BallTip(1.0), 1.0, depth)  # where sqrt(R indentation) is 1
     ratio = felt / soft.relaxation_modulus_1s_pa
     assert 1 < ratio < truth
@@ -135,8 +136,32 @@ def test_inclusions_are_felt_more_the_shallower_and_the_nearer(library):
     assert np.all(np.diff(away) < 0)
     # the same tissue buried is not felt at all
     same = Buried("same", Sphere((0, 0, -0.002), 0.002), soft)
-    felt = same.felt_at(np.zeros(3), soft, 1e-3)
+    felt = felt_at(np.zeros(3), soft, [same], 1e-3)
     assert felt.relaxation_modulus_1s_pa == pytest.approx(soft.relaxation_modulus_1s_pa)
+
+
+def test_several_inclusions_are_felt_by_their_shares_in_any_order(library):
+    soft, hard = library["white"], library["tumour"]
+    ball = Buried("ball", Sphere((0.0, 0.0, -0.006), 0.005), hard)
+    deeper = HalfSpace((0.0, 0.0, -0.0111), (0.0, 0.0, 1.0))
+    shares = [energy_share(shape, np.zeros(3), 1.7e-3) for shape in (ball.shape, deeper)]
+    assert min(shares) > 0.1
+
+    def felt(*buried):
+        return felt_at(np.zeros(3), soft, buried, 1.7e-3).relaxation_modulus_1s_pa
+
+    layer = Buried("layer", deeper, library["cortex"])
+    moduli = [t.relaxation_modulus_1s_pa for t in (soft, hard, library["cortex"])]
+    want = 1 / np.sum(np.array([1 - sum(shares), *shares]) / moduli)
+    assert felt(ball, layer) == pytest.approx(want, rel=1e-12)
+    assert felt(layer, ball) == pytest.approx(want, rel=1e-12)
+    # a layer that is none takes nothing from the ball
+    assert felt(ball, Buried("none", deeper, soft)) == pytest.approx(felt(ball), rel=1e-12)
+    # where they overlap the later one is there
+    around = Buried("around", Sphere((0.0, 0.0, -0.0065), 0.006), soft)
+    assert felt(ball, around) == pytest.approx(moduli[0], rel=1e-12)
+    assert felt(around, ball) == pytest.approx(felt(ball), rel=1e-12)
+    assert felt(around, Buried("all", EVERYWHERE, hard)) == pytest.approx(moduli[1], rel=1e-12)
 
 
 def test_gelatine_gradient_is_linear_in_concentration(library):
@@ -268,7 +293,7 @@ def test_wrong_materials_are_named(tmp_path, library, change, named):
 
 def test_a_box_can_be_buried(library):
     box = Box((-0.01, -0.01, -0.01), (0.01, 0.01, -0.001))
-    felt = Buried("box", box, library["gel16"]).felt_at(np.zeros(3), library["gel10"], 1e-3)
+    felt = felt_at(np.zeros(3), library["gel10"], [Buried("box", box, library["gel16"])], 1e-3)
     assert 18.3e3 < felt.relaxation_modulus_1s_pa < 48.5e3
 
 
