@@ -130,6 +130,7 @@ class Plant:
         self.site_m: Vector | None = None
         self._site_touched = False
         self._slip = ORIGIN  # elastic displacement of the contact along the surface
+        self._lateral_n_per_m = 0.0  # its stiffness there
         self._held_n = ORIGIN  # force on what holds the tip: the beam's, where there is one
         self._turn = IDENTITY[0]  # of the tip
         self._stepped = False
@@ -234,13 +235,19 @@ class Plant:
         self.site_m, self._site_touched = place, False
 
     def _friction(self, way: Vector, normal: Vector, pushed: float) -> Vector:
-        """Force along the surface on the ball [N]."""
+        """Force along the surface on the ball [N].
+
+        A contact that grows keeps this force, since what has just touched is not displaced yet; one that
+        shrinks keeps the displacement. So it gives no energy (Mindlin & Deresiewicz 1953).
+        """
         if pushed <= 0 or self.depth_m <= 0:
             self._slip = ORIGIN
             return ORIGIN
-        (x, y, z), (dx, dy, dz) = self._slip, way
-        x, y, z = beside((x + dx, y + dy, z + dz), normal)
         stiffness = SLIP * 1.5 * pushed / self.depth_m
+        kept = min(1.0, self._lateral_n_per_m / stiffness)
+        self._lateral_n_per_m = stiffness
+        (x, y, z), (dx, dy, dz) = self._slip, way
+        x, y, z = beside((kept * x + dx, kept * y + dy, kept * z + dz), normal)
         length, most = math.hypot(x, y, z), self.friction * pushed / stiffness
         if length > most:
             share = most / length

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plant: forces of the indenter in the base, friction, and what the load cell feels."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -8,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.vectors import vector
-from tactile_resonance.simulation.plant.plant import Plant
+from tactile_resonance.simulation.plant.plant import SLIP, Plant
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, RoundSurface, relative_radius_m
 from tactile_resonance.simulation.plant.tip import RigidTip, SprungIndenter, Tip
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -109,6 +111,27 @@ def test_friction_sticks_below_its_limit_and_slides_at_it():
         p.step(at(x, 0, RADIUS_M - 4e-4), 0.002)
         assert np.hypot(p.force_n[0], p.force_n[1]) <= 0.3 * p.force_n[2] * (1 + 1e-9)
     assert -p.force_n[0] == pytest.approx(0.3 * normal, rel=1e-3)
+
+
+def test_friction_builds_up_with_the_contact_and_gives_no_energy():
+    # pressed obliquely on elastic tissue: the integral of the stiffness, which goes as the root of the depth
+    p = plant(friction=5.0)
+    for part in np.linspace(0.0, 1.0, 1001):
+        p.step(at(2e-5 * part, 0, RADIUS_M - 4e-4 * part), 0.002)
+    stiffness = SLIP * 1.5 * hertz(4e-4) / 4e-4
+    assert -p.force_n[0] == pytest.approx(2 / 3 * stiffness * 2e-5, rel=2e-3)
+    # sheared under a light press and released under a hard one, and the other way round
+    corners = [(0, 5e-5), (2e-5, 5e-5), (2e-5, 3e-4), (0, 3e-4)]
+    for cycle in (corners, corners[::-1]):
+        p, work = plant(friction=5.0), 0.0
+        p.step(at(0, 0, RADIUS_M - cycle[0][1]), 0.002)
+        for start, end in pairwise([*cycle, cycle[0], *cycle[1:], cycle[0]]):
+            for part in np.linspace(0, 1, 101)[1:]:
+                x, depth = np.array(start) + part * (np.array(end) - start)
+                before, force = np.array(p.tip_m), np.array(p.force_n)
+                p.step(at(x, 0, RADIUS_M - depth), 0.002)
+                work += (force + p.force_n) / 2 @ (np.array(p.tip_m) - before)
+        assert work < 0
 
 
 def test_a_fresh_place_is_unrelaxed_and_the_old_one_remembers():
