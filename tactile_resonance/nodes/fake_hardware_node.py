@@ -36,7 +36,6 @@ from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.simulation.sensor.bench import (
     BenchEffects,
     BenchRun,
-    BenchTip,
     ContactSoFar,
     SimulatedBench,
 )
@@ -278,16 +277,19 @@ class FakeHardwareNode(ManagedNode):
             entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
             self._touch.take_up()
             tip, so_far = self._touch.tip, None
-            if self._touch.plant is not None and tip.tissue is not None:
+            pressed = self._touch.plant is not None and tip.tissue is not None
+            if pressed and not effects.nonlinearity:  # which takes the contact as fixed
                 so_far = ContactSoFar(self._bench, tip)
-            run = self._start(tip, so_far, int(entropy.generate_state(1, np.uint64)[0]), effects)
+            coupled = tip.coupled(self._bench) if so_far is None else so_far.coupled_at
+            noise_seed = int(entropy.generate_state(1, np.uint64)[0])
+            run = BenchRun(self._bench.sensor, coupled, noise_seed, effects)
             self._silence()
             start_ns = self._now_ns()
             ends_ns = (
                 start_ns + round(count * excitation.period_s * 1e9)
                 for count in range(1, excitation.periods + 1)
             )
-            hand_out = self._hand_out(run, excitation, start_ns, so_far)
+            hand_out = self._hand_out(run, excitation, start_ns, so_far, pressed)
             self._playing = Playing(self.time_server, ends_ns, hand_out)
         except (ValueError, ClockLostError) as error:
             response.message = str(error)
@@ -318,31 +320,18 @@ class FakeHardwareNode(ManagedNode):
             response.message = str(error)
         return response
 
-    def _start(
-        self, tip: BenchTip, so_far: ContactSoFar | None, seed: int, effects: BenchEffects
-    ) -> BenchRun:
-        """A run from rest; the nonlinearity takes the contact as fixed."""
-        if so_far is not None and not effects.nonlinearity:
-            return self._bench.start_varying(so_far.coupled_at, seed=seed, effects=effects)
-        return self._bench.start(
-            tip.tissue,
-            force_n=tip.force_n or None,
-            hold_time_s=tip.since_s,
-            seed=seed,
-            effects=effects,
-        )
-
     def _hand_out(
         self,
         run: BenchRun,
         excitation: Excitation,
         start_ns: int,
         so_far: ContactSoFar | None,
+        pressed: bool,
     ) -> Callable[[int], None]:
         """What makes and publishes a block at its end: only then is it known what became of the contact.
 
-        A contact of the plant has its truth with every block: the mean over all blocks so far, with the stamp
-        that their poles will have.
+        A contact of the plant (`pressed`) has its truth with every block: the mean over all blocks so far, with
+        the stamp that their poles will have.
         """
         touch, blocks = self._touch, run.play(excitation, excitation.periods)
         pose, tip = touch.stays.newest.pose, touch.tip
@@ -351,9 +340,11 @@ class FakeHardwareNode(ManagedNode):
         def hand_out(end_ns: int) -> None:
             if so_far is not None:
                 so_far.extend(excitation.period_s, touch.contact_over(end_ns - block_ns, end_ns))
+            if pressed:
+                parts = [run.coupled] if so_far is None else so_far.parts
                 pose.header.stamp = time_message((start_ns + end_ns) // 2)
                 whose = excitation.measurement_id, self._frame_id
-                touch.truths.publish(truth_message(pose, tip, so_far.parts, *whose))
+                touch.truths.publish(truth_message(pose, tip, parts, *whose))
             block = next(blocks)
             origin = Origin(
                 measurement_id=excitation.measurement_id,

@@ -1,52 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bench's service to play an excitation, asked once more because its answer was lost."""
+"""The bench's service to play an excitation: asked once more, and what it plays on."""
 
 import os
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from spinning import spin_until
 from tactile_resonance.srv import Play
 
 from tactile_resonance import msg
 from tactile_resonance.multisine import design_multisine
-from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
+from tactile_resonance.nodes.fake_hardware_node import EFFECTS, FakeHardwareNode
 from tactile_resonance.nodes.messages import excitation_to_message
 from tactile_resonance.nodes.running import RESULTS, initialised
 from tactile_resonance.processes import free_domain_id
+from tactile_resonance.recording.messages import record_from_message
+from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.sensor.bench import (
+    BenchEffects,
+    BenchRun,
+    BenchTip,
+    SimulatedBench,
+)
+from tactile_resonance.simulation.tissue.library import read_tissues
+from tactile_resonance.simulation.tissue.scene import read_scene
 
 PERIODS = 4
 
 
 @pytest.fixture
-def bench():
+def node():
     with initialised(args=["--ros-args"], domain_id=free_domain_id(os.environ)):
-        node, executor = FakeHardwareNode(), SingleThreadedExecutor()
+        node = FakeHardwareNode()
         node.trigger_configure()
         node.trigger_activate()
-        executor.add_node(node)
-        blocks = []
-        node.create_subscription(msg.Record, "bench/block", blocks.append, RESULTS)
-
-        def ask(excitation_id, **changed):
-            excitation = design_multisine(periods=PERIODS, excitation_id=excitation_id, **changed)
-            message = excitation_to_message(excitation, 0, "tip")
-            return node._on_play(Play.Request(excitation=message), Play.Response())
-
-        def all_of(excitation_id):
-            def found():
-                return [b for b in blocks if b.excitation_id == excitation_id]
-
-            assert spin_until(executor, lambda: any(b.block_index == PERIODS - 1 for b in found()))
-            return [b.block_index for b in found()]
-
-        yield ask, all_of, node._silence
+        yield node
         node.trigger_deactivate()
         node.destroy_node()
+
+
+@pytest.fixture
+def bench(node):
+    executor, blocks = SingleThreadedExecutor(), []
+    executor.add_node(node)
+    node.create_subscription(msg.Record, "bench/block", blocks.append, RESULTS)
+
+    def ask(excitation_id, **changed):
+        return asked(node, periods=PERIODS, excitation_id=excitation_id, **changed)
+
+    def all_of(excitation_id):
+        def found():
+            return [b for b in blocks if b.excitation_id == excitation_id]
+
+        assert spin_until(executor, lambda: any(b.block_index == PERIODS - 1 for b in found()))
+        return [b.block_index for b in found()]
+
+    return ask, all_of, node._silence
+
+
+def asked(node, **design):
+    message = excitation_to_message(design_multisine(**design), 0, "tip")
+    return node._on_play(Play.Request(excitation=message), Play.Response())
 
 
 def test_the_same_excitation_asked_for_again_plays_on(bench):
@@ -80,3 +100,36 @@ def test_another_excitation_of_the_same_id_is_played(bench):
 def test_excitations_without_an_id_are_never_the_same(bench):
     ask, _, _ = bench
     assert ask(0).start != ask(0).start
+
+
+class Held:
+    """A plant that holds the tip on gelatine, deeper than Hertz has it under this force."""
+
+    STATE = {
+        **{"time_s": 5.0, "tip_m": TABLE_IN_BASE[:3], "site_m": TABLE_IN_BASE[:3], "stalls": 0},
+        **{"normal_force_n": 0.008, "contact_s": 3.0, "contact_radius_m": 1.1e-3, "depth_m": 4e-4},
+    }
+    alive = True
+
+    def ask(self, what):
+        assert what == "truth"
+        return self.STATE
+
+
+def test_a_sensor_that_is_not_linear_plays_on_the_contact_whose_truth_is_told(node):
+    node.set_parameters([Parameter(name, value=name == "nonlinearity") for name in EFFECTS])
+    node._touch.plant = Held()
+    truths, blocks = [], []
+    node._touch.truths.publish = truths.append
+    node._blocks.publish = blocks.append
+    assert asked(node, excitation_id=7, measurement_id=3, periods=1, level_v=0.5).accepted
+    assert spin_until(SingleThreadedExecutor(), lambda: blocks)
+    tissue = read_scene(read_tissues()).tissue_at((0.0, 0.0))
+    tip = BenchTip(tissue, 0.008, 3.0, 1.1e-3, 4e-4)
+    bench = SimulatedBench.from_configuration()
+    effects = BenchEffects(noise=False, quantisation=False, nonlinearity=True)
+    run = BenchRun(bench.sensor, tip.coupled(bench), 0, effects)
+    want = run.block(design_multisine(periods=1, level_v=0.5)).sensor.volts()
+    np.testing.assert_allclose(record_from_message(blocks[0]).sensor.volts(), want, rtol=0, atol=1e-9)
+    assert truths[-1].measurement_id == 3
+    np.testing.assert_allclose(truths[-1].f0_hz, [mode.f0_hz for mode in run.truth().modes])
