@@ -57,11 +57,12 @@ from tactile_resonance.scan.run_content import RunContent, file_of
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import read_tissues
-from tactile_resonance.simulation.tissue.scene import PhantomScene, read_scene
+from tactile_resonance.simulation.tissue.scene import Box, PhantomScene, read_scene
 from tactile_resonance.tissue.classify import UNKNOWN
 
 BOUNDARY, RECORDING = "boundary.json", "map.mcap"
-_TRUTH_CELLS = 16  # along the longer side; between them the truth is interpolated
+_TRUTH_CELLS = 16  # along each side; between them the truth is interpolated
+_EVERYWHERE = Box((-math.inf, -math.inf), (math.inf, math.inf))
 COLOURS = LinearSegmentedColormap.from_list(
     "pole_map", [np.array(LOW_RGB) / 255, np.array(HIGH_RGB) / 255]
 )
@@ -148,7 +149,10 @@ def boundary_of_run(run: RunContent) -> RunBoundary | None:
         phantoms = read_scene(read_tissues(), run.path / "scene.yaml")
     except ValueError:  # simulated without a scene of the bench
         return found
-    truth = true_f0_hz(phantoms, asked, boundary.level_set.levels[0])
+    hold_s = 1.0
+    if (nominal := scene.nominal_contact) is not None:  # to which poles were carried over
+        phantoms, hold_s = replace(phantoms, force_n=nominal.force_n), nominal.age_s
+    truth = true_f0_hz(phantoms, asked, boundary.level_set.levels[0], hold_s)
     surface = asked.krige(known_points(run.latest))
     assert surface is not None  # else there were no boundary
     return replace(
@@ -158,18 +162,27 @@ def boundary_of_run(run: RunContent) -> RunBoundary | None:
     )
 
 
-def true_f0_hz(phantoms: PhantomScene, asked: Adaptive, near_hz: float) -> np.ndarray:
-    """(r, c) true f0 of the mode near a frequency over the raster of a region [Hz]; NaN where nothing lies."""
-    raster = asked.raster
+def true_f0_hz(
+    phantoms: PhantomScene, asked: Adaptive, near_hz: float, hold_time_s: float = 1.0
+) -> np.ndarray:
+    """(r, c) true f0 of the mode near a frequency over the raster of a region [Hz]; NaN where nothing lies.
+
+    Interpolated within what one region of the phantoms would be if it were everywhere: their edges stay sharp.
+    """
+    xy_m = asked.raster.xy_m
     low, high = asked.polygon_m.min(axis=0), asked.polygon_m.max(axis=0)
     axes = [np.linspace(low[k], high[k], _TRUTH_CELLS + 1) for k in range(2)]
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    felt = truth_over(SimulatedBench.from_configuration(), phantoms, at)
-    sensors: list[Any] = felt.ravel().tolist()
-    f0 = [math.nan if sensor is None else sensor.mode_near(near_hz).f0_hz for sensor in sensors]
-    values = np.reshape(f0, felt.shape)
-    method = "cubic" if np.all(np.isfinite(values)) else "linear"
-    return np.asarray(RegularGridInterpolator(axes, values, method=method)(raster.xy_m))
+    bench, there = SimulatedBench.from_configuration(), phantoms.region_index(xy_m)
+    found = np.full(there.shape, math.nan)
+    for index in set(there[there >= 0].tolist()):
+        alone = replace(phantoms, regions=(replace(phantoms.regions[index], shape=_EVERYWHERE),))
+        felt = truth_over(bench, alone, at, hold_time_s=hold_time_s)
+        sensors: list[Any] = felt.ravel().tolist()
+        values = np.reshape([each.mode_near(near_hz).f0_hz for each in sensors], felt.shape)
+        of_region = RegularGridInterpolator(axes, values, method="cubic")(xy_m)
+        found = np.where(there == index, of_region, found)
+    return found
 
 
 def draw_pole_map(pole_map: PoleMap, title: str, boundary: RunBoundary | None = None) -> Figure:

@@ -9,7 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.report import run_map
-from tactile_resonance.report.run_map import boundary_of_run, draw_pole_map, write_map_recording
+from tactile_resonance.report.run_map import (
+    boundary_of_run,
+    draw_pole_map,
+    true_f0_hz,
+    write_map_recording,
+)
 from tactile_resonance.scan.map_messages import CLOUD, MARKERS, POINT
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_file import read_content, read_messages
@@ -19,6 +24,9 @@ from tactile_resonance.scan.pole_map import MapPoint, PoleMap
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scene import read_scan_scene
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.tissue.library import read_tissues, uniform
+from tactile_resonance.simulation.tissue.scene import Disc, PhantomScene, Region, read_scene
 
 TABLE_IN_BASE = [0.3, -0.1, 0.05, 0.0, 0.0, np.pi / 2]
 TIP = Rotation.from_rotvec([0.1, 0.2, -0.3])
@@ -189,17 +197,48 @@ def test_the_boundary_drawn_is_that_of_boundary_json(tmp_path):
     at = ((float(x), float(y), 0.0) for x, y in touched)
     plan = [ScanPoint(k, place, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)) for k, place in enumerate(at)]
     facts = {"scan_node": {"table_in_base": TABLE_IN_BASE, "base_frame": "base"}}
-    with RunDirectory.create(tmp_path / "run", scene.read_text(), plan, facts) as run:
+    text = scene.read_text().replace("  force_n: 0.01\n  age_s: 1.0\n", "  force_n: 0.012\n  age_s: 3.0\n")
+    with RunDirectory.create(tmp_path / "run", text, plan, facts) as run:
         for point in plan:
             x_m, y_m, _ = point.position_m
             with run.begin_point(point.index) as recording:
                 result = result_of(point.index, f0_hz=float(f0_hz[point.index]))
                 recording.finish(replace(result, x_m=x_m, y_m=y_m))
     content = read_run(tmp_path / "run")
-    found = boundary_of_run(content).boundary
+    of_run = boundary_of_run(content)
+    found = of_run.boundary
     assert found.outline_m
+    # of the contact to which the poles of the map refer
+    phantoms = replace(read_scene(read_tissues(), scene), force_n=0.012)
+    truth = true_f0_hz(phantoms, adaptive, found.level_set.levels[0], 3.0)
+    want = adaptive.raster.lines(found.level_set.depth(truth))
+    np.testing.assert_array_equal(np.concatenate(of_run.true_outline_m), np.concatenate(want))
     *_, (_, last) = told(write_map_recording(content), "/pole_map/markers")
     outline, band = (marker for marker in last.markers if marker.ns == "boundary")
     for marker, lines in ((outline, found.outline_m), (band, (*found.inner_m, *found.outer_m))):
         drawn = [(point.x, point.y) for point in marker.points[::2]]  # each begins a stretch of a line
         np.testing.assert_allclose(drawn, np.concatenate([line[:-1] for line in lines]), atol=1e-12)
+
+
+def test_truth_of_a_map_is_sharp_at_edges_and_is_that_of_the_nominal_contact():
+    asked = read_scan_scene(share_path("config/scenes/demo.yaml")).adaptive
+    library, centre_m, radius_m = read_tissues(), (0.7e-3, 0.4e-3), 4e-3
+    tissues = [library["gel10"], library["gel16"]]
+    phantoms = PhantomScene(
+        "dish in a dish",
+        0.01,
+        tuple(
+            Region(tissue.name, Disc(place, radius), uniform(tissue))
+            for tissue, place, radius in zip(tissues, ((0, 0), centre_m), (7e-3, radius_m), strict=True)
+        ),
+    )
+    bench = SimulatedBench.from_configuration()
+    for force_n, hold_s in ((0.01, 1.0), (0.008, 3.0)):
+        held = {"force_n": force_n, "hold_time_s": hold_s}
+        want = [bench.coupled(tissue, **held).mode_near(255.0).f0_hz for tissue in tissues]
+        got = true_f0_hz(replace(phantoms, force_n=force_n), asked, 255.0, hold_s)
+        xy_m = asked.raster.xy_m
+        within = [np.linalg.norm(xy_m - c, axis=-1) <= r for c, r in (((0, 0), 7e-3), (centre_m, radius_m))]
+        want_there = np.where(within[1], want[1], np.where(within[0], want[0], np.nan))
+        np.testing.assert_allclose(got, want_there, rtol=1e-9)
+        assert 0 < np.isnan(got).mean() < 0.5
