@@ -64,19 +64,28 @@ class OnSoft(ABC):
         """Its part of `tangent`."""
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
-        """See `Indenter.swing`."""
+        """See `Indenter.swing`; in shorter steps where the ball meets what is stiff."""
         base_m, rate_m_s = base
         for n in range(count):
-            base_now_m = base_m + n * h_s * rate_m_s
-            ball = swing(*self.tangent(h_s), *ball, base_now_m, rate_m_s, h_s, *beam)
-            self.step(ball[0], h_s)
+            parts = self._parts(beam, ball, h_s)
+            for part in range(parts):
+                base_now_m = base_m + (n + part / parts) * h_s * rate_m_s
+                short_s = h_s / parts
+                ball = swing(*self.tangent(short_s), *ball, base_now_m, rate_m_s, short_s, *beam)
+                self.step(ball[0], short_s)
         return ball
+
+    def _parts(self, beam: Beam, ball: Motion, h_s: float) -> int:
+        """Steps that a swing over a time takes."""
+        return 1
 
 
 Ball = Indenter | OnSoft
 """What presses on the tip."""
 
 BONE_PA, BONE_POISSON_RATIO = 10e6, 0.3
+TURN_RAD = 0.2
+"""Of a swing on bone in a step."""
 
 
 class OnBone(OnSoft):
@@ -109,6 +118,13 @@ class OnBone(OnSoft):
 
     def _act(self, up_m_s: float) -> float:
         return self._ahead(0.0)[0]
+
+    def _parts(self, beam: Beam, ball: Motion, h_s: float) -> int:
+        """By the stiffness of the bone as deep as the ball may come: it turns by `TURN_RAD` in each."""
+        depth_m, speed_m_s = ball
+        inside_m = depth_m + abs(speed_m_s) * h_s - self._layer_m
+        stiffness = 1.5 * self._c * math.sqrt(max(0.0, inside_m))
+        return max(1, ceil(h_s * math.sqrt(stiffness / beam[2]) / TURN_RAD))
 
     def _ahead(self, dt_s: float) -> tuple[float, float]:
         """Force of the bone and its slope (Hertz)."""

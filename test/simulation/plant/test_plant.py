@@ -12,7 +12,14 @@ from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.plant.plant import SLIP, Plant
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, RoundSurface, relative_radius_m
-from tactile_resonance.simulation.plant.tip import RigidTip, SprungIndenter, Tip
+from tactile_resonance.simulation.plant.tip import (
+    BONE_PA,
+    BONE_POISSON_RATIO,
+    OnBone,
+    RigidTip,
+    SprungIndenter,
+    Tip,
+)
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
@@ -244,6 +251,27 @@ def test_beam_keeps_swinging_while_the_tip_comes_down_along_a_tilt():
         p.step(at(0, 0, RADIUS_M + height), 0.002)
     assert p.in_contact
     assert len(made) == 1
+
+
+def test_bone_neither_gives_nor_takes_energy_of_a_ball_on_the_beam():
+    # moved above the bone in one step, the ball swings and hits it; the base stands
+    hardly_there = Tissue("air", 1.0, (), ())
+    k, m = 14.8, 2.65e-4
+    bone = OnBone(
+        Indenter(hardly_there, tip_radius_m=RADIUS_M, poisson_ratio=NU), layer_m=0.0, radius_m=RADIUS_M
+    )
+    tip = SprungIndenter(bone, stiffness_n_per_m=k, mass_kg=m, damping_ns_per_m=0.0)
+    base_m, stiffness = -5e-5, 4 / 3 * BONE_PA / (1 - BONE_POISSON_RATIO**2) * np.sqrt(RADIUS_M)
+    tip.step(base_m - 1e-4, 0.002)
+    energy, hits = [], 0
+    for _ in range(200):
+        tip.step(base_m, 0.002)
+        depth_m = tip.tip_depth_m
+        hits += depth_m > 0
+        swing = k / 2 * (base_m - depth_m) ** 2 + m / 2 * tip._speed**2
+        energy.append(swing + 2 / 5 * stiffness * max(0.0, depth_m) ** 2.5)
+    assert hits > 5
+    np.testing.assert_allclose(energy, energy[0], rtol=0.03)
 
 
 def test_not_stepped_is_said():
