@@ -43,7 +43,7 @@ from tactile_resonance.recording.messages import (
     fill_complex,
     time_from_message,
 )
-from tactile_resonance.simulation.plant.defaults import PRIORITY, READY, order
+from tactile_resonance.simulation.plant.defaults import MOST_STEPS, PRIORITY, READY, order
 from tactile_resonance.simulation.plant.surfaces import LaidScene
 from tactile_resonance.simulation.sensor.bench import BenchTip, ContactState, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, parts_of
@@ -280,10 +280,13 @@ class SimulatedTip:
         self._put(Stay(place.time_ns, force_n, pose_to_message(place)), tip)
 
     def contact_over(self, from_ns: int, to_ns: int) -> list[ContactState | None]:
-        """The contact over an interval, as fine as the sensor follows it; unchanged where the plant ended."""
+        """The contact over an interval, as fine as the sensor follows it, of a block of more than 10 s coarser.
+
+        Unchanged where the plant ended.
+        """
         assert self.plant is not None
         from_s, to_s = (ns * 1e-9 + self._plant_ahead_s for ns in (from_ns, to_ns))
-        parts = parts_of(to_s - from_s)
+        parts = min(parts_of(to_s - from_s), MOST_STEPS)
         try:
             answer = self.plant.ask("contact_over", after_s=from_s, until_s=to_s, parts=parts)
         except OSError:

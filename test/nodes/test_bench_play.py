@@ -21,7 +21,8 @@ from tactile_resonance.nodes.messages import excitation_to_message
 from tactile_resonance.nodes.running import RESULTS, initialised
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import record_from_message
-from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
+from tactile_resonance.simulation.plant.defaults import MOST_STEPS, TABLE_IN_BASE
+from tactile_resonance.simulation.plant.tabletop import PlantHistory
 from tactile_resonance.simulation.sensor.bench import (
     BenchEffects,
     BenchRun,
@@ -111,9 +112,10 @@ class Held:
     }
     alive = True
 
-    def ask(self, what):
-        assert what == "truth"
-        return self.STATE
+    def ask(self, what, **fields):
+        if what == "truth":
+            return self.STATE
+        return PlantHistory(None).contact_over(fields)  # nothing was kept
 
 
 def test_a_sensor_that_is_not_linear_plays_on_the_contact_whose_truth_is_told(node):
@@ -133,3 +135,11 @@ def test_a_sensor_that_is_not_linear_plays_on_the_contact_whose_truth_is_told(no
     np.testing.assert_allclose(record_from_message(blocks[0]).sensor.volts(), want, rtol=0, atol=1e-9)
     assert truths[-1].measurement_id == 3
     np.testing.assert_allclose(truths[-1].f0_hz, [mode.f0_hz for mode in run.truth().modes])
+
+
+def test_contact_over_a_long_block_is_asked_for_in_as_many_parts_as_are_answered(node):
+    node._touch.plant = Held()
+    node._touch.take_up()
+    second = 10**9
+    assert node._touch.contact_over(second, 3 * second) == [None] * 50
+    assert node._touch.contact_over(second, 21 * second) == [None] * MOST_STEPS

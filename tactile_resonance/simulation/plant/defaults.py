@@ -32,6 +32,9 @@ CAN_PORT = 29536
 CONTROL_PORT = 30020
 """Of orders, at the robot's address; docs/robot.md lists them."""
 
+MOST_STEPS = 250
+"""Steps or parts in one answer about what was: to write more would hold the plant up."""
+
 
 def order(
     host: str, command: str, port: int = CONTROL_PORT, timeout_s: float = 5.0, **fields: Any

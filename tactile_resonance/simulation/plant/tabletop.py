@@ -25,6 +25,7 @@ from tactile_resonance.fields import number, read_dataclass, require
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.cell.tcp_bus import TcpBus
 from tactile_resonance.simulation.cell.transducer import LoadCell
+from tactile_resonance.simulation.plant.defaults import MOST_STEPS
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.plant.surfaces import FlatSurface, LaidScene, SurfaceMotion
@@ -35,9 +36,6 @@ from tactile_resonance.simulation.tissue.library import TissueLibrary
 
 KEEP_STEPS = 30_000
 """A minute at 500 Hz."""
-
-MOST_STEPS = 250
-"""In one answer: to write more would hold the plant up."""
 
 
 class _PlantStep(NamedTuple):
