@@ -16,7 +16,7 @@ from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.free_motion import STILL_M_S
 from tactile_resonance.contact.geometry import TipPath
 from tactile_resonance.contact.goal import TOUCHING, Command, ContactGoal, State
-from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, Cell, ForceError
+from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, Cell, ForceError, Mount
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.result import ContactResult
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
@@ -155,8 +155,12 @@ class ContactLoop:
             # without a state of the arm in this cycle, wrenches are referred to its last known pose
             pose = self._pose = arm or self._pose
             if felt and pose is not None:
+                goal, mounting = self.controller.goal, self._force.mounting
                 turn = turn_from_vector(pose.rotation_rad)
-                wrenches = self._force.mounting.to_tip(felt, pose.position_m, turn)
+                if goal is not None and mounting.mount is Mount.TABLE:
+                    # that its weight, which goes with the tare, does not turn with a tip that is put right
+                    turn = goal.touch.turn
+                wrenches = mounting.to_tip(felt, pose.position_m, turn)
         self._seen, self.fault = arm, fault
         # the arm keeps a velocity, so a stop is sent until it has worked, whatever state that ends in
         command = self.controller.step(now, arm, wrenches, fault) or self._owed

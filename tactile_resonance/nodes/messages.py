@@ -300,7 +300,7 @@ def write_force_over(
 def wrench_message(
     wrenches: Sequence[WrenchSample], cycle: Cycle, ros_ns: RosTime, frame_id: str
 ) -> WrenchStamped:
-    """Mean of these, less the tare, at the middle of their times."""
+    """Mean of these at the middle of their times; of the force, not of the torque, the tare is taken off."""
     wrench = WrenchStamped()
     wrench.header.stamp = time_message(ros_ns((wrenches[0].time_ns + wrenches[-1].time_ns) // 2))
     wrench.header.frame_id = frame_id

@@ -1,10 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The zero from one contact to the next: its stated deviation against Monte Carlo, and what is no walk."""
+"""The zero from one contact to the next: its stated deviation against Monte Carlo, and what is no walk.
+
+And the weight on a cell under the sample, part of it, under a tip that is turned between tare and hold.
+"""
+
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from tactile_resonance.contact.geometry import touch_pose
+from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.loop import ContactLoop
+from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.observer import Zero
+from tactile_resonance.contact.parameters import Limits
+from tactile_resonance.contact.samples import Pose
+from tactile_resonance.simulation.plant.contact_bench import ContactBench
+from tactile_resonance.simulation.plant.surfaces import FlatSurface
+from tactile_resonance.simulation.plant.tip import Tip
+
+sys.path.insert(0, str(Path(__file__).parent))
+from contacts import FORCE_N, QUICK, RADIUS_M, SOFT
 
 WALK, STD_N, EVERY_S = 5e-5, 9e-5, 2.5
 
@@ -66,3 +85,23 @@ def test_an_axis_that_shows_one_number_is_known_by_it():
     np.testing.assert_allclose(zero.force_n, [0.0, 1e-3, 0.0])
     np.testing.assert_allclose(zero.std_n, [0.0, 0.0, STD_N / np.sqrt(2)])
     assert before.with_look(Zero(np.array([1e-6, 1e-3, 0.0]), one, 10**9), 0.0) is None
+
+
+@pytest.mark.parametrize("turned_rad", [-0.004, 0.004, 0.02])
+def test_the_weight_on_a_cell_under_the_sample_does_not_turn_with_the_tip(turned_rad):
+    # 2 N on the cell: 1 mrad about y is 2 mN along x of the tip, on a slope of 0.5 rad 1 mN along its z
+    normal = np.array([np.sin(0.5), 0.0, np.cos(0.5)])
+    touch = touch_pose([0, 0, 0], normal, [1, 0, 0], RADIUS_M)
+    turn = Rotation.from_rotvec([0, turned_rad, 0]) * touch.rotation
+    start = Pose(touch.position_m + 2.5e-3 * normal, turn.as_rotvec())
+    bench = ContactBench(SOFT, FlatSurface(np.zeros(3), normal), start, tip=Tip(RADIUS_M))
+    controller = ContactController(QUICK, Limits(), under_sample=True)
+    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
+    loop.start(ContactGoal(touch, Aim(FORCE_N)))
+    loop.run_while(lambda: controller.state not in (State.HOLD, State.FAULT), 20.0)
+    assert controller.state is State.HOLD, controller.result
+    true_n = []
+    bench.clock.on_step.append(lambda: true_n.append(normal @ bench.plant.force_n))
+    loop.run_while(lambda: True, 0.3)
+    result = controller.result
+    assert abs(result.force_n - np.mean(true_n)) < 4 * result.force_std_n
