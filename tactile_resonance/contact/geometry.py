@@ -297,7 +297,8 @@ def _end_of(sweep: Sweep) -> Turn:
 def _lowest(sweep: Sweep, normal: Vector, place_m: Vector) -> float:
     """Least height along a normal of a place in the frame `tip`, seen from the ball's centre [m].
 
-    By Rodrigues' formula it is a sinusoid of the angle, whose trough is on the way or not.
+    By Rodrigues' formula it is a sinusoid of the angle, whose trough is on the way or not. Half a turn may go
+    either way round, by what little the tip is off where it begins.
     """
     first, rotation_rad = sweep
     begun, angle = rotated(first, place_m), math.hypot(*rotation_rad)
@@ -307,7 +308,7 @@ def _lowest(sweep: Sweep, normal: Vector, place_m: Vector) -> float:
     still = dot(normal, axis) * dot(axis, begun)
     cosine, sine = dot(normal, begun) - still, dot(normal, cross(axis, begun))
     trough = math.atan2(-sine, -cosine) % (2 * math.pi)
-    if trough <= angle:
+    if trough <= angle or angle > math.pi - 2 * PASSED_RAD:
         return still - math.hypot(cosine, sine)
     return still + min(cosine, cosine * math.cos(angle) + sine * math.sin(angle))
 

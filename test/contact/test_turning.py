@@ -88,6 +88,8 @@ def test_turns_are_just_so_high_that_the_whole_arc_is_clear_of_both_planes(press
         assert (turns[4].inv() * new.rotation).magnitude() < 1e-9
         arc = Rotation.concatenate([turned(turns[1], turns[2]), turned(turns[2], turns[3])])
         above = places[4] - raised(new, QUICK.standoff_m).position_m
+        # half a turn is clear either way round, and higher than either needs
+        half = (turns[3] * turns[2].inv()).magnitude() > np.pi - 2 * PASSED_RAD
         for at, through in ((places[1], arc), (places[4], turns[4])):
             spare = []
             for touch, up in ((start, LIMITS.depth_m), (new, QUICK.early_m)):
@@ -96,7 +98,7 @@ def test_turns_are_just_so_high_that_the_whole_arc_is_clear_of_both_planes(press
                 spare.append(np.min(housing) - up - MARGIN_M - LIMITS.clearance_m)
             assert min(spare) > -1e-6
             # no higher than needed; the arc as it is sampled may miss its lowest point by a little
-            assert min(spare) < 1e-5 or (at is places[4] and np.linalg.norm(above) < 1e-9)
+            assert half or min(spare) < 1e-5 or (at is places[4] and np.linalg.norm(above) < 1e-9)
         # no steeper than the steeper end
         tilts = [r.as_matrix()[..., 2, 2].min() for r in (arc, turns[1], turns[4])]
         assert tilts[0] > min(tilts[1:]) - 1e-9
@@ -108,6 +110,24 @@ def test_turns_are_just_so_high_that_the_whole_arc_is_clear_of_both_planes(press
         # and up it goes all the way over both
         for touch in (old, new):
             assert (places[1] - places[0]) @ touch.rotation.as_matrix()[:, 2] > -1e-9
+
+
+@pytest.mark.parametrize("short_rad", [0.0, 0.008])
+def test_half_a_turn_is_clear_of_both_planes_either_way_round(short_rad):
+    rng = np.random.default_rng(18)
+    for _ in range(50):
+        old, first = random_touch(rng), random_touch(rng)
+        swing = np.cross(old.rotation.as_matrix()[:, 2], normal := first.rotation.as_matrix()[:, 2])
+        swing *= np.arcsin(np.linalg.norm(swing)) / np.linalg.norm(swing)
+        swung = Rotation.from_rotvec(swing) * old.rotation
+        half = Rotation.from_rotvec((np.pi - short_rad) * normal)
+        new = Pose(first.position_m, (half * swung).as_rotvec())
+        way = TurningWay(TipPath(ContactGoal(new, AIM), TIP), sample(old), QUICK, LIMITS)
+        angles = np.linspace(0, 2 * np.pi, 400)
+        circle = Rotation.from_rotvec(angles[:, None] * normal) * swung
+        for touch, up in ((old, LIMITS.depth_m), (new, QUICK.early_m)):
+            _, housing = heights(touch, stops(way)[0][2], circle)
+            assert np.min(housing) - up - MARGIN_M - LIMITS.clearance_m > -1e-6
 
 
 class Travel:
