@@ -15,7 +15,7 @@ import math
 from statistics import mean, stdev
 
 from tactile_resonance.contact.envelope import Place, inside
-from tactile_resonance.contact.geometry import ARRIVED_M, ARRIVED_RAD, TipPath, TurningWay
+from tactile_resonance.contact.geometry import ARRIVED_M, TipPath, TurningWay
 from tactile_resonance.contact.goal import REST, Move, State, failed
 from tactile_resonance.contact.observer import Observer, Zero
 from tactile_resonance.contact.parameters import REACTION_S, Workspace
@@ -142,13 +142,8 @@ class FreeMotion:
             if looked and self._observer.end_tare(now_ns, self._zero) is None:
                 return Move(None, State.APPROACH)
             return Move(None, State.TARE)
-        if self._zero is not None and self._path.off_rad(arm) < ARRIVED_RAD:
-            if (
-                not self._observer.taring
-            ):  # in air, and a cell under the sample does not feel the arm
-                self._observer.begin_tare()
-        elif self._observer.taring:
-            self._zero, self._observer.taring = None, False
+        if self._zero is not None and not self._observer.taring:
+            self._observer.begin_tare()  # in air, and a cell under the sample does not feel the arm
         return Move(self._path.travel(arm, p, self._limits.near_m))
 
     def tare(self, now_ns: int, arm: ArmSample) -> Move:
