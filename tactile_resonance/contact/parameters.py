@@ -242,7 +242,7 @@ class Limits:
     lateral_speed_m_s: float = within(2e-3, 0.0, 0.02, "Speed along the surface in contact [m/s].")
     free_speed_m_s: float = within(0.1, 1e-3, 0.5, "Speed elsewhere [m/s].")
     angular_speed_rad_s: float = within(0.3, 0.0, 2.0, "Of turns anywhere [rad/s].")
-    tilt_rad: float = within(0.8, 1e-3, 1.6, "Between +z of the tip and the vertical [rad].")
+    tilt_rad: float = within(0.8, 1e-3, 1.6, "Between +z of the tip and that of the base [rad].")
     misalignment_rad: float = within(
         0.05, 1e-3, 0.5, "Between the tip and its goal while near the surface [rad]."
     )

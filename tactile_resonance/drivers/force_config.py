@@ -23,6 +23,7 @@ from tactile_resonance.contact.interfaces import (
     ForceError,
     ForceFault,
     ForceInfo,
+    Mount,
     NodeArm,
 )
 from tactile_resonance.contact.payload import Mounting
@@ -242,8 +243,11 @@ class RtdeWrench:
     """
 
     def __init__(self, config: ForceConfig, arm: NodeArm) -> None:
-        if config.frame.vector.any() or config.payload is not None:
-            raise ValueError("frame, payload: expected zeros and none, the controller knows both")
+        moved = config.frame.vector.any() or config.payload is not None
+        if moved or config.mount is not Mount.TOOL:
+            raise ValueError(
+                "mount, frame, payload: expected tool, zeros and none, the controller knows them"
+            )
         self.mounting: Mounting = config
         self._config, self._arm, self._clock = config, arm, arm.clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)

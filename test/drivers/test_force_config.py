@@ -190,6 +190,11 @@ def test_the_wrench_is_turned_into_the_frame_of_the_tip():
     assert source.read() == []  # one state, one wrench
 
 
+def test_a_wrench_of_the_tip_is_not_taken_for_one_under_the_sample():
+    with pytest.raises(ValueError, match="mount, frame, payload: expected tool"):
+        RtdeWrench(replace(CONFIG, mount=Mount.TABLE), States())
+
+
 def test_it_can_be_made_before_the_arm_is_connected():
     connected = []
 
