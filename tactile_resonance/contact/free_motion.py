@@ -21,7 +21,7 @@ from tactile_resonance.contact.observer import Observer, Zero
 from tactile_resonance.contact.parameters import REACTION_S, Workspace
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample
-from tactile_resonance.contact.vectors import Vector, added, dot, scaled, vector
+from tactile_resonance.contact.vectors import Vector, added, difference, dot, scaled, vector
 
 STILL_M_S, STILL_NS = 5e-4, 50_000_000
 """Below this speed for so long the arm is at rest [m/s], [ns]."""
@@ -173,11 +173,14 @@ class FreeMotion:
 
     def _touched(self, where: str) -> Move | None:
         """Result where something pushes: without a zero only a change of the force shows that."""
-        force_n = self._observer.watch.force_n
+        force_n, p = self._observer.watch.force_n, self._parameters
         if self._travel_force_n is None:
             self._travel_force_n = force_n
-        change = math.dist(force_n, self._travel_force_n)
-        if change <= max(TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL * self._parameters.cell_noise_n):
+        x, y, z = difference(force_n, self._travel_force_n)
+        # along the normal inertia is taken off; across it a tool on the cell shows how it is moved
+        across = max(0.0, math.hypot(x, y) - p.carried_kg * p.acceleration_m_s2)
+        change = math.hypot(across, z)
+        if change <= max(TOUCH_IN_TRAVEL_N, NOISES_IN_TRAVEL * p.cell_noise_n):
             return None
         return failed(Cause.SURFACE_EARLY, f"force changed by {1e3 * change:.1f} mN {where}")
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
@@ -98,6 +99,19 @@ def test_tip_rests_again_where_the_zero_is_not_known(why):
     order, result, _ = states(rig, aim)
     assert State.TARE in order
     assert result.reached
+
+
+def test_a_tool_on_the_cell_that_is_moved_along_the_surface_is_no_touch():
+    # 30 g at 0.5 m/s2 are 15 mN along the surface, 13 mN (8 times the noise) would be a touch
+    tool = replace(P, carried_kg=0.03, cell_noise_n=1.6e-3)
+    for push_n, after in ((0.0, State.TARE), (0.02, State.FAULT)):
+        rig = contact(height_m=0.0, start_m=3e-3, parameters=tool, mount=Mount.TOOL)
+        rig.run(0.1)
+        rig.loop.start(goal(rig, x_m=2e-3))
+        rig.run(0.02)
+        rig.bench.cell.faults.bias_step_n = push_n
+        rig.loop.run_while(lambda r=rig: r.controller.state is State.TRAVEL, 5.0)
+        assert rig.controller.state is after
 
 
 def test_approach_begins_as_low_as_a_goal_asks_for_and_ends_there():
