@@ -64,7 +64,7 @@ PARAMETERS = (
     ),
     Fixed("touch_false_alarm", 1e-6, "Probability of a false alarm of one block [-].", 1e-12, 0.1),
     Fixed("frame_id", "tip", "Frame of the sensor's tip."),
-    Fixed("base_frame", "base", "Frame of the robot's base, of all poses."),
+    Fixed("base_frame", "base", "Frame of the robot's base, of all poses; of a UR not base_link."),
     Fixed("sensor_frame", "sensor", "Frame in the beam's clamp, +x to the ball."),
     Fixed("tool_frame", "tool", "Frame of the robot's flange or tool."),
     BROADCAST_TF,
