@@ -53,6 +53,10 @@ class LyingForce(Lying):
     def mounting(self):
         return self
 
+    @property
+    def mount(self):
+        return self._device.mounting.mount
+
     def to_tip(self, samples, tip_m, tip_turn):
         return [self._seen(s) for s in self._device.mounting.to_tip(samples, tip_m, tip_turn)]
 
