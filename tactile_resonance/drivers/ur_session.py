@@ -13,10 +13,12 @@ import time
 from collections.abc import Iterator
 
 import dashboard_client
+import numpy as np
 import rtde_control
 
 from tactile_resonance.clock import Demand, SimulatedClock
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.drivers.ur_config import UrArmConfig
 from tactile_resonance.drivers.ur_exchange import REST
 from tactile_resonance.processes import loose_timers, take_priority, thread_ids
@@ -162,7 +164,9 @@ class Session:
         if not control.setTcp(tip):
             raise ArmError(ArmFault.COMMAND_REFUSED, f"setTcp {tip} was refused")
         offset = control.getTCPOffset()
-        if max(abs(a - b) for a, b in zip(offset, tip, strict=True)) > 1e-6:
+        # one rotation has several vectors: of half a turn either direction of the axis is right
+        off = Pose.from_vector(np.array(offset)).seen_from(config.tip_in_flange).vector
+        if not np.all(np.abs(off) <= 1e-6):
             raise ArmError(
                 ArmFault.COMMAND_REFUSED, f"the robot's TCP is {offset} after it was set to {tip}"
             )

@@ -13,6 +13,7 @@ import pytest
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.drivers.rtde_stream import RobotState, StateReader, motion_fault
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
@@ -325,6 +326,37 @@ def test_what_the_library_raises_for_want_of_an_answer_is_a_lost_link(silent):
     with pytest.raises(ArmError, match=rf"127.0.0.1: {silent}\(\) function did not succeed!") as error:
         session.restart()
     assert error.value.fault is ArmFault.LINK_LOST
+
+
+@pytest.mark.parametrize(
+    ("answer", "taken"),
+    [
+        ([0, 0, 0.12, 0, np.pi, 0], True),
+        ([0, 0, 0.12, 0, -np.pi, 0], True),
+        ([0, 0, 0.12, 0, 3 * np.pi, 0], True),
+        ([0, 0, 0.12, 0, np.pi - 1e-5, 0], False),
+        ([0, 0, 0.12001, 0, np.pi, 0], False),
+        ([0, 0, np.nan, 0, np.pi, 0], False),
+    ],
+)
+def test_the_tip_is_taken_whatever_vector_its_rotation_comes_back_as(answer, taken):
+    pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
+    from tactile_resonance.drivers.ur_session import Session
+
+    class TakenError(Exception):
+        """The next call was reached."""
+
+    def next_call(*_):
+        raise TakenError
+
+    tip = Pose.from_vector(np.array([0, 0, 0.12, 0, np.pi, 0]))
+    config = UrArmConfig(host="127.0.0.1", tip_in_flange=tip, payload_kg=1.0)
+    session = Session(config, None)
+    session.control = SimpleNamespace(
+        setTcp=lambda _: True, getTCPOffset=lambda: answer, setPayload=next_call
+    )
+    with pytest.raises(TakenError if taken else ArmError):
+        session._prepare()
 
 
 class Reader:
