@@ -199,6 +199,8 @@ class ContactController:
         if not self._free_for_goals:
             raise NotIdleError(f"goal: refused in state {self.state.value}; accepted in idle")
         p = self.parameters.lowered(goal.standoff_m, goal.press_speed_m_s)
+        if self._under_sample:  # what the robot carries is not on the cell
+            p = replace(p, carried_kg=0.0)
         limits = self.limits
         limits.check(p)
         check_goal(goal, p, limits, self._tip)

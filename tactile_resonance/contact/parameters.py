@@ -126,7 +126,7 @@ class ContactParameters:
     )
     carried_kg: float = within(
         *(0.0, 0.0, 5.0),
-        "Mass beyond a tool-mounted cell, whose inertia it feels [kg]; 0 under the sample.",
+        "Mass beyond a tool-mounted cell, whose inertia it feels [kg]; none under the sample.",
     )
     cell_lag_s: float = within(
         *(0.002, 0.0, 0.05),

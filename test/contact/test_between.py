@@ -114,6 +114,13 @@ def test_a_tool_on_the_cell_that_is_moved_along_the_surface_is_no_touch():
         assert rig.controller.state is after
 
 
+def test_a_cell_under_the_sample_feels_no_inertia_of_the_robot():
+    rig = contact(
+        height_m=0.0, start_m=5e-3, parameters=replace(P, carried_kg=0.03), under_sample=True
+    )
+    assert rig.loop.make(rig.goal).reached, rig.controller.result
+
+
 def test_approach_begins_as_low_as_a_goal_asks_for_and_ends_there():
     rig = made()
     states(rig, goal(rig))
