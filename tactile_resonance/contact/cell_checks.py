@@ -29,7 +29,7 @@ def require_fit(info: ForceInfo, force_n: float) -> None:
     """Refuse a source that cannot serve a force.
 
     The limits are those with which the contact controller was simulated: with three times the noise the
-    95 % quantile of its overshoot goes from 10 to 33 % (docs/force_sensors.md).
+    95 % quantile of its overshoot goes from 8 to 17 % (docs/force_sensors.md).
 
     Parameters
     ----------
