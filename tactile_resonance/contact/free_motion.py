@@ -96,6 +96,11 @@ class FreeMotion:
             self._turning = TurningWay(self._path, arm, self._parameters, self._limits)
         self.begun = True
 
+    def lifts(self, arm: ArmSample) -> bool:
+        """Whether it goes straight up to the standoff: it stands lower, beside the surface or on it."""
+        standoff_m = self._parameters.standoff_m
+        return self._turning is None and self._path.must_lift(arm, standoff_m)
+
     def judge_way(self, arm: ArmSample) -> Breach | None:
         """Whether the tip is near the way of this goal, from where it was first seen."""
         if self._box is None:
@@ -129,7 +134,7 @@ class FreeMotion:
             self._turning = None
         # a cell under the sample feels the tip wherever it is, one on the tool how it is moved
         near = place.height_m < self._limits.near_m or self._under_sample
-        if self._path.must_lift(arm, p.standoff_m):
+        if self.lifts(arm):
             # it may still press, where something ended while it did: up before it goes along
             return Move(self._path.lift(arm, p))
         if near and math.isfinite(self._observer.watch.age_s(now_ns)):

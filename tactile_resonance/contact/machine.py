@@ -444,7 +444,9 @@ class ContactController:
             depth = model.surface_m - above
             self._pressed_n = min(goal.aim.force_n, model.force_at(above))
             above = -depth
-        housing_m = path.housing_m(arm, above)
+        # the plane of the goal says nothing of what lies lower beside it
+        lifted = self.state is State.TRAVEL and self._free.lifts(arm)
+        housing_m = None if lifted else path.housing_m(arm, above)
         return Place(path.normal, self._height_m, depth, path.off_rad(arm), housing_m)
 
     def _enter(self, state: State, now_ns: int) -> None:

@@ -89,3 +89,10 @@ def test_tip_that_dips_its_housing_in_the_approach_is_stopped():
     assert made.controller.result.cause is Cause.HOUSING
     assert "mm above the surface" in made.controller.result.message
     assert max(made.force_n) == 0
+
+
+def test_tip_that_begins_far_below_the_plane_of_its_goal_is_lifted_to_it():
+    # 30 mm below it, as over a lower step: the housing is below that plane and above nothing
+    made = with_tip(TipGeometry(), height_m=-0.5, start_m=-0.03)
+    made.loop.start(made.goal)
+    assert made.run_until(made.controller.state.TARE), made.controller.result
