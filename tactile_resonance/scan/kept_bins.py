@@ -21,7 +21,6 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -90,16 +89,22 @@ class BinsKind:
 
 @dataclass(frozen=True)
 class Piece:
-    """An array of rows of one kind, in a file that was found to be whole."""
+    """Rows of one kind, an array of a file found to be whole; its ``kinds`` have the checksum `kinds_crc`."""
 
     kind: BinsKind
     path: Path
     name: str
     count: int
+    kinds_crc: int
 
     def read(self) -> npt.NDArray:
-        """(count,) rows."""
+        """(count,) rows; ``ValueError`` where the file was replaced: its rows may be of another band."""
         with np.load(self.path) as arrays:
+            if _kinds_crc(arrays.zip) != self.kinds_crc:
+                raise ValueError(
+                    f"{self.path}: replaced meanwhile, by a command with another band or as the run has grown; "
+                    "accepted is one such command at a time"
+                )
             return np.asarray(arrays[self.name])
 
 
@@ -126,7 +131,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         with np.load(path) as arrays:
             if arrays.zip.testzip() is not None:
                 return None
-            content = json.loads(str(arrays["kinds"]))
+            content, kinds_crc = json.loads(str(arrays["kinds"])), _kinds_crc(arrays.zip)
         low_hz, high_hz = content["band_hz"]
         if content["format"] != FORMAT or content["files"] != files:
             return None
@@ -134,7 +139,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
             BinsKind(**{**kind, "harmonics": tuple(kind["harmonics"])}) for kind in content["kinds"]
         ]
         pieces = [
-            Piece(kind, path, f"points_{k}_{j}", count)
+            Piece(kind, path, f"points_{k}_{j}", count, kinds_crc)
             for k, (kind, counts) in enumerate(zip(kinds, content["counts"], strict=True))
             for j, count in enumerate(counts)
         ]
@@ -229,14 +234,14 @@ def write_bins(
 ) -> KeptBins:
     """Write ``bins.npz`` of rows with their kinds; what is left out may be added to while these come."""
     waiting: dict[BinsKind, list[npt.NDArray]] = {}  # in the order in which kinds came first
-    pieces: dict[BinsKind, list[Piece]] = {}
+    pieces: dict[BinsKind, list[tuple[str, int]]] = {}  # name and rows of each
     with whole_npz(run / NAME) as members:
 
         def write(kind: BinsKind) -> None:
             rows, of_kind = np.concatenate(waiting[kind]), pieces.setdefault(kind, [])
             name = f"points_{[*waiting].index(kind)}_{len(of_kind)}"
             write_array(members, name, rows)
-            of_kind.append(Piece(kind, run / NAME, name, rows.size))
+            of_kind.append((name, rows.size))
             waiting[kind].clear()
 
         for kind, rows in found:
@@ -250,12 +255,21 @@ def write_bins(
             "format": FORMAT,
             "band_hz": list(band_hz),
             "kinds": [asdict(kind) for kind in waiting],
-            "counts": [[piece.count for piece in pieces[kind]] for kind in waiting],
+            "counts": [[count for _, count in pieces[kind]] for kind in waiting],
             "files": files,
             "left_out": left_out,
         }
         write_array(members, "kinds", np.array(json.dumps(content)))
-    return KeptBins(tuple(chain.from_iterable(pieces[kind] for kind in waiting)), tuple(left_out))
+    kinds_crc = _kinds_crc(members)
+    made = (
+        Piece(kind, run / NAME, *piece, kinds_crc) for kind in waiting for piece in pieces[kind]
+    )
+    return KeptBins(tuple(made), tuple(left_out))
+
+
+def _kinds_crc(members: zipfile.ZipFile) -> int:
+    """Checksum of what a file holds, of which band and of which files."""
+    return members.getinfo("kinds.npy").CRC
 
 
 def _files(run: Path) -> dict[str, int]:

@@ -201,6 +201,19 @@ def test_bins_are_made_once_and_again_for_a_wider_band_or_when_the_run_has_grown
     assert [row["measurement_id"] for row in table(run / "reidentified.csv")] == ["102", "101"]
 
 
+def test_bins_that_another_command_replaced_are_not_read(tmp_path):
+    """Those of a wider band begin at another bin: poles at 250 Hz would be found at 270 Hz, status ok."""
+    run = make_run(tmp_path / "run", [list(measurement(100))])
+    (piece,) = kept_bins.keep_bins(run, (225.0, 275.0)).pieces
+    assert piece.read()["measurement_id"] == [100]
+    (wider,) = kept_bins.keep_bins(run, (205.0, 295.0)).pieces
+    with pytest.raises(ValueError, match="replaced meanwhile"):
+        piece.read()
+    (kept,) = kept_bins.kept_bins(run, (225.0, 275.0)).pieces
+    assert kept == wider
+    assert kept.read()["measurement_id"] == [100]
+
+
 def test_a_run_may_grow_while_its_bins_are_made(tmp_path):
     run, band_hz = make_run(tmp_path / "run", [list(measurement(100))]), (210.0, 290.0)
 
