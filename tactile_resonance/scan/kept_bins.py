@@ -212,6 +212,8 @@ def keep_bins(
     """
     files, content = _files(run), read_run(run)
     left_out = list(content.problems)
+    if left_out:
+        files = {}  # of no run: what is damaged may be restored, so bins are made again
 
     def rows() -> Iterator[tuple[BinsKind, npt.NDArray]]:
         jobs = ((run, result, band_hz) for result in content.latest)

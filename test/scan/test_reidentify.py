@@ -201,6 +201,19 @@ def test_bins_are_made_once_and_again_for_a_wider_band_or_when_the_run_has_grown
     assert [row["measurement_id"] for row in table(run / "reidentified.csv")] == ["102", "101"]
 
 
+def test_a_point_whose_file_was_restored_is_there_again(tmp_path, capsys):
+    run = make_run(tmp_path / "run", [list(measurement(100 + k)) for k in range(2)])
+    file = run / "recording" / "point-00001-00.mcap"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-9] + bytes(1) + whole[-8:])  # one byte of the footer, of the same size
+    assert main(["reidentify", str(run)]) == 0
+    assert "left out" in capsys.readouterr().out
+    file.write_bytes(whole)
+    assert main(["reidentify", str(run)]) == 0
+    assert "left out" not in capsys.readouterr().out
+    assert [row["index"] for row in table(run / "reidentified.csv")] == ["0", "1"]
+
+
 def test_bins_that_another_command_replaced_are_not_read(tmp_path):
     """Those of a wider band begin at another bin: poles at 250 Hz would be found at 270 Hz, status ok."""
     run = make_run(tmp_path / "run", [list(measurement(100))])
