@@ -21,6 +21,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -234,7 +235,13 @@ def write_bins(
     files: dict[str, int],
     left_out: list[str],
 ) -> KeptBins:
-    """Write ``bins.npz`` of rows with their kinds; what is left out may be added to while these come."""
+    """Write ``bins.npz`` of rows with their kinds; what is left out may be added to while these come.
+
+    Without a row what is kept stays: of a band without lines, for example.
+    """
+    found = iter(found)
+    if (first := next(found, None)) is None:
+        return KeptBins((), tuple(left_out))
     waiting: dict[BinsKind, list[npt.NDArray]] = {}  # in the order in which kinds came first
     pieces: dict[BinsKind, list[tuple[str, int]]] = {}  # name and rows of each
     with whole_npz(run / NAME) as members:
@@ -246,7 +253,7 @@ def write_bins(
             of_kind.append((name, rows.size))
             waiting[kind].clear()
 
-        for kind, rows in found:
+        for kind, rows in chain([first], found):
             own = waiting.setdefault(kind, [])
             if own and (len(own) + 1) * rows.nbytes > BYTES_AT_ONCE:
                 write(kind)

@@ -178,6 +178,9 @@ def test_bins_are_made_once_and_again_for_a_wider_band_or_when_the_run_has_grown
     assert not made()
     command += ["--band", "220", "280"]  # within
     assert not made()
+    assert main(["reidentify", str(run), "--band", "1", "2"]) == 1  # no line there: nothing is replaced
+    capsys.readouterr()
+    assert not made()
     command[-2:] = ["200", "300"]
     assert made()
     assert not made()
