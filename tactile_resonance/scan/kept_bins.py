@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
@@ -287,22 +288,34 @@ def _files(run: Path) -> dict[str, int]:
 
 
 @contextlib.contextmanager
-def whole_npz(path: Path) -> Iterator[zipfile.ZipFile]:
-    """An ``.npz`` file to be written array by array, which is there whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    # without a name: whatever ends this process, nothing of it is left
-    with tempfile.TemporaryFile(dir=path.parent) as growing:
-        with zipfile.ZipFile(growing, "w") as members:
-            yield members
-        growing.seek(0)
+def whole_files(*paths: Path) -> Iterator[list[IO[bytes]]]:
+    """Files to be written piece by piece, which are there whole or not at all, all of them together."""
+    parts = [path.with_name(path.name + ".part") for path in paths]
+    with contextlib.ExitStack() as open_files:
+        # without a name: whatever ends this process, nothing of it is left, and no other one writes to it
+        growing: list[IO[bytes]] = [
+            open_files.enter_context(tempfile.TemporaryFile(dir=path.parent)) for path in paths
+        ]
+        yield growing
         try:
-            with part.open("wb") as file:
-                shutil.copyfileobj(growing, file, 1 << 20)
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(path)
+            for part, content in zip(parts, growing, strict=True):
+                content.seek(0)
+                with part.open("wb") as file:
+                    shutil.copyfileobj(content, file, 1 << 20)
+                    file.flush()
+                    os.fsync(file.fileno())
+            for part, path in zip(parts, paths, strict=True):
+                part.replace(path)
         finally:
-            part.unlink(missing_ok=True)
+            for part in parts:
+                part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_npz(path: Path) -> Iterator[zipfile.ZipFile]:
+    """An ``.npz`` file to be written array by array; see `whole_files`."""
+    with whole_files(path) as (growing,), zipfile.ZipFile(growing, "w") as members:
+        yield members
 
 
 def write_array(members: zipfile.ZipFile, name: str, array: npt.NDArray) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import signal
+import zipfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -35,7 +36,7 @@ from tactile_resonance.scan.kept_bins import (
     Piece,
     keep_bins,
     kept_bins,
-    whole_npz,
+    whole_files,
     write_array,
 )
 from tactile_resonance.scan.point_result import MODE
@@ -132,7 +133,6 @@ def reidentify(
     ]
     dtype = row_type(max(each.order // 2 for each in structures))
     counts, left_out = Counter[str](), list[str]()
-    part = csv.with_name(csv.name + ".part")
     with _Processes() as processes:
         kept = []
         for run, band, model in zip(runs, bands, structures, strict=True):
@@ -149,26 +149,20 @@ def reidentify(
             for piece in of_run.pieces
         )
         head = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (total,)}
-        try:
-            with part.open("w", encoding="utf-8") as text, whole_npz(npz) as members:
-                text.write(",".join(dtype.names or ()) + "\n")
-                with members.open("points.npy", "w", force_zip64=True) as points:
-                    np.lib.format.write_array_header_2_0(points, head)
-                    for rows, lines in processes.in_order(_identified, jobs):
-                        points.write(rows.tobytes())
-                        text.write(lines)
-                        codes = np.bincount(rows[STATUS], minlength=len(STATUSES))
-                        counts.update(dict(zip(_STATUSES, codes.tolist(), strict=True)))
-                        done += rows.size
-                        progress("poles", done, total)
-                write_array(members, "runs", np.array([str(run) for run in runs]))
-                write_array(members, "poles_statuses", np.array(_STATUSES))
-                write_array(members, "bands_hz", np.array(bands))
-                text.flush()
-                os.fsync(text.fileno())
-            part.replace(csv)
-        finally:
-            part.unlink(missing_ok=True)
+        with whole_files(csv, npz) as (text, arrays), zipfile.ZipFile(arrays, "w") as members:
+            text.write((",".join(dtype.names or ()) + "\n").encode())
+            with members.open("points.npy", "w", force_zip64=True) as points:
+                np.lib.format.write_array_header_2_0(points, head)
+                for rows, lines in processes.in_order(_identified, jobs):
+                    points.write(rows.tobytes())
+                    text.write(lines.encode())
+                    codes = np.bincount(rows[STATUS], minlength=len(STATUSES))
+                    counts.update(dict(zip(_STATUSES, codes.tolist(), strict=True)))
+                    done += rows.size
+                    progress("poles", done, total)
+            write_array(members, "runs", np.array([str(run) for run in runs]))
+            write_array(members, "poles_statuses", np.array(_STATUSES))
+            write_array(members, "bands_hz", np.array(bands))
     return +counts, left_out
 
 

@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 
 from tactile_resonance.cli import main
+from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.scan import kept_bins, reidentify
-from tactile_resonance.scan.kept_bins import whole_npz, write_array
+from tactile_resonance.scan.kept_bins import whole_files, whole_npz, write_array
 from tactile_resonance.scan.messages import to_cdr
 from tactile_resonance.scan.run_directory import RunDirectory
 
@@ -230,6 +231,23 @@ def test_bins_that_another_command_replaced_are_not_read(tmp_path):
     assert kept.read()["measurement_id"] == [100]
 
 
+def test_two_that_write_to_one_name_mix_nothing(tmp_path):
+    """The table of the one that ends last is its own, as if the other had never been."""
+    run = make_run(tmp_path / "run", [list(measurement(100))])
+    csv, npz, once = tmp_path / "out.csv", tmp_path / "out.npz", []
+
+    def meanwhile(what, done, of):
+        if what == "poles" and not once:
+            once.append(True)
+            reidentify.reidentify([run], csv, npz, None, ModelStructure.with_residual(4))
+
+    reidentify.reidentify([run], csv, npz, progress=meanwhile)
+    text = csv.read_text()
+    assert once
+    reidentify.reidentify([run], csv, npz)
+    assert csv.read_text() == text
+
+
 def test_a_run_may_grow_while_its_bins_are_made(tmp_path):
     run, band_hz = make_run(tmp_path / "run", [list(measurement(100))]), (210.0, 290.0)
 
@@ -384,3 +402,26 @@ def test_an_unfinished_file_is_none(tmp_path):
     with np.load(path) as arrays:
         np.testing.assert_array_equal(arrays["x"], rows)
         assert arrays["more"] == "text"
+
+
+def test_of_two_files_none_is_there_unless_both_fit_on_the_disk(tmp_path, monkeypatch):
+    paths = tmp_path / "a", tmp_path / "b"
+
+    def write(content):
+        with whole_files(*paths) as files:
+            for file in files:
+                file.write(content)
+
+    write(b"before")
+    synced, sync = [], os.fsync
+
+    def full(descriptor):
+        synced.append(sync(descriptor))
+        if len(synced) == len(paths):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write(b"after")
+    assert [path.read_bytes() for path in paths] == [b"before"] * 2
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
