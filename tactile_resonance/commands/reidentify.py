@@ -59,6 +59,8 @@ def run(options: argparse.Namespace) -> int:
         several = len(options.runs) > 1
         require(not several, "--output", None, "one name for the result of several runs")
         output = options.runs[0] / "reidentified"
+    of_run = (output.parent / "run.json").is_file() and output.name in ("results", "mechanics", "bins")
+    require(not of_run, "--output", str(output), "a name that no file of the run itself has")
     csv, npz = (output.with_name(output.name + ending) for ending in (".csv", ".npz"))
     begun_s = time.monotonic()
     with ProgressBar(unit_scale=True) as bar:
