@@ -21,6 +21,7 @@ from tactile_resonance.fields import number, read_yaml, require
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.points import require_near, scan_points
 from tactile_resonance.scan.scene import ScanScene, parse_notes, parse_scan_scene
+from tactile_resonance.scan.surface import with_file_beside
 from tactile_resonance.strict_yaml import dump_yaml
 from tactile_resonance.tissue.references import with_library
 
@@ -96,10 +97,10 @@ def named_frames(goal: ScanGoal, frames: Frames) -> tuple[str, ...]:
     return tuple({name for name in named if name and name not in (frames.table, frames.base)})
 
 
-def read_goal(goal: ScanGoal, frames: Frames) -> tuple[Plan, str]:
-    """Plan of the scene that a goal for a new run asks for, and that scene as a scene file.
+def read_goal(goal: ScanGoal, frames: Frames) -> tuple[Plan, str, Path | None]:
+    """Plan of the scene that a goal for a new run asks for, that scene as a scene file, and that of its surface.
 
-    Both with what the goal has in place of the file's.
+    Both with what the goal has in place of the file's; the scene file expects that of its surface beside it.
 
     Raises
     ------
@@ -120,14 +121,17 @@ def read_goal(goal: ScanGoal, frames: Frames) -> tuple[Plan, str]:
     named = isinstance(content.get("tissue_classes"), str)
     content = with_library({**content, **changes}, path)  # a run holds what it was scanned with
     scene = replace(parse_scan_scene(content, path), frame_id=frame_id)
+    beside, file = with_file_beside(content.get("surface"), path.parent)
+    if file is not None and beside != content["surface"]:
+        content["surface"] = changes["surface"] = beside
     text = dump_yaml(content)
     if goal.scene and not (changes or named):
         text = path.read_text(encoding="utf-8")
     if not len(poses):
-        return make_plan(scene), text
+        return make_plan(scene), text, file
     normals = Rotation.from_quat(poses[:, 3:]).apply([0.0, 0.0, 1.0])  # (n, 3)
     points = scan_points(scene.name, poses[:, :3], normals, poses[:, 3:])
-    return plan_points(scene, points), text
+    return plan_points(scene, points), text, file
 
 
 def resumed_run(goal: ScanGoal) -> Path:

@@ -3,7 +3,7 @@
 
 ::
 
-    RUN/scene.yaml                      the scene as it was given
+    RUN/scene.yaml                      the scene as it was given, and beside it the file of its surface, if any
     RUN/run.json                        plan, versions, seeds, what was skipped; written again where a scan
                                         that chooses its points appends one
     RUN/recording/point-00003-00.mcap   one file per attempt at a point (here point 3, first attempt)
@@ -119,6 +119,7 @@ class RunDirectory:
         facts: Mapping[str, Any],
         needed_bytes: int = 0,
         places: Sequence[ScanPoint] = (),
+        beside: Path | None = None,
     ) -> Self:
         """Begin a run.
 
@@ -136,6 +137,8 @@ class RunDirectory:
             What the run may take on disk; `expected_bytes` estimates it.
         places : sequence of ScanPoint
             Among which further points will be chosen.
+        beside : Path, optional
+            File that the scene names, to be copied beside it.
 
         Raises
         ------
@@ -153,6 +156,8 @@ class RunDirectory:
         text = _plan_text(RunContent(path, scene, facts, tuple(points), places=tuple(places)))
         (path / RECORDING).mkdir(parents=True)
         with _locked(path) as lock:
+            if beside is not None:
+                write_whole(path / beside.name, beside.read_bytes())
             write_whole(path / SCENE, scene.encode())
             write_entries(path, [entry_of(path / SCENE, SCENE)])
             write_whole(path / "run.json", text)  # last: with it the run exists

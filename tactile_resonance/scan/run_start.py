@@ -46,7 +46,7 @@ StartedRun = tuple[Plan, RunDirectory, int]
 
 def new_run(
     goal: ScanGoal, frames: Frames, files: GoalFiles, *, forces: bool
-) -> tuple[Plan, str, Path, int]:
+) -> tuple[Plan, str, Path | None, Path, int]:
     """What a goal asks for, with nothing moved or written yet: `read_goal`, the run's folder and its bytes.
 
     Parameters
@@ -63,12 +63,12 @@ def new_run(
     ValueError, OSError
         If it is wrong, or the run cannot begin in its folder.
     """
-    plan, text = read_goal(goal, frames)
+    plan, text, beside = read_goal(goal, frames)
     _require_force(plan.scene, forces)
     path = Path(goal.run_directory) if goal.run_directory else files.unused()
     needed = expected_bytes(plan.most_points, plan.measurement)
     RunDirectory.check_new(path, needed)
-    return plan, text, path, needed
+    return plan, text, beside, path, needed
 
 
 def start_run(
@@ -104,7 +104,7 @@ def start_run(
     """
     if goal.resume:
         return _resumed(resumed_run(goal), frames, hands)
-    wanted, text, path, needed = new_run(goal, frames, files, forces=hands.free_air)
+    wanted, text, beside, path, needed = new_run(goal, frames, files, forces=hands.free_air)
     scene = _placed(wanted.scene, frames, hands)
     _require_tests(scene, hands)
     radius_m = sensor_named(scene.sensor.name).tip.radius_m
@@ -128,7 +128,7 @@ def start_run(
         **found,
     }
     places = plan.points if scene.adaptive else ()
-    run = RunDirectory.create(path, text, plan.first_points, facts, needed, places)
+    run = RunDirectory.create(path, text, plan.first_points, facts, needed, places, beside)
     return plan, run, seed
 
 

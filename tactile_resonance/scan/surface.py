@@ -361,6 +361,18 @@ def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface
     return build(entry.surface, f"{where}.{form}", folder) if filed else entry
 
 
+def with_file_beside(fields: object, folder: Path) -> tuple[Any, Path | None]:
+    """A scene's section ``surface`` for a copy of the scene beside which its file lies, and that file.
+
+    None where it names none.
+    """
+    for form, value in fields.items() if isinstance(fields, Mapping) else ():
+        if isinstance(value, Mapping) and isinstance(value.get("file"), str):
+            path = folder / value["file"]
+            return {form: {**value, "file": path.name}}, path
+    return fields, None
+
+
 @dataclass(frozen=True)
 class _Mesh:
     file: FileName

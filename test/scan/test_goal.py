@@ -50,7 +50,7 @@ def again(text, tmp_path):
 
 
 def test_poses_need_no_scene_and_give_points_at_exactly_these_places(tmp_path):
-    plan, text = read_goal(GOAL, FRAMES)
+    plan, text, _ = read_goal(GOAL, FRAMES)
     assert tuple((*p.position_m, *p.orientation_xyzw) for p in plan.points) == POSES
     assert plan.points[1].normal == pytest.approx(TILTED.apply([0, 0, 1]).tolist())
     for scene in (plan.scene, again(text, tmp_path)):
@@ -68,7 +68,7 @@ def test_poses_in_the_base_are_those_places_in_the_frame_of_the_scene(scene):
 
 
 def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene, tmp_path):
-    plan, text = read_goal(ScanGoal(scene=scene), FRAMES)
+    plan, text, _ = read_goal(ScanGoal(scene=scene), FRAMES)
     assert text == SCENE
     assert [p.position_m[2] for p in plan.points] == [0.0, 0.0]
     goal = ScanGoal(
@@ -79,14 +79,14 @@ def test_a_goal_has_force_precision_notes_and_places_in_place_of_its_scene(scene
         damping_ratio_std=1e-4,
         notes="{tip_wetness: wet}",
     )
-    plan, text = read_goal(goal, FRAMES)
+    plan, text, _ = read_goal(goal, FRAMES)
     for read in (plan.scene, again(text, tmp_path)):
         assert read.force_n == 0.02
         assert read.precision == Precise(None, 1e-4)
         assert read.notes.tip_wetness == "wet"
         assert read.positions_m.tolist() == [list(pose[:3]) for pose in POSES]
     assert "gelatine_percent" in text  # the bench reads it too
-    unset, _ = read_goal(ScanGoal(scene=scene, force_n=math.nan, f0_std_hz=math.nan), FRAMES)
+    unset, _, _ = read_goal(ScanGoal(scene=scene, force_n=math.nan, f0_std_hz=math.nan), FRAMES)
     assert (unset.scene.force_n, unset.scene.precision) == (0.01, Precise(0.05))
 
 
@@ -98,7 +98,7 @@ def test_a_run_holds_the_classes_of_the_library_that_its_scene_names(scene, tmp_
         "tissue_classes:\n  gel: {f0_hz: 254, damping_ratio: 0.03, f0_std_hz: 1, damping_ratio_std: 1e-3}\n"
         "spread: {}\n"
     )
-    plan, text = read_goal(ScanGoal(scene=str(path)), FRAMES)
+    plan, text, _ = read_goal(ScanGoal(scene=str(path)), FRAMES)
     for read in (plan.scene, again(text, tmp_path)):
         assert [each.name for each in read.tissue_classes] == ["gel"]
 
@@ -156,7 +156,7 @@ def test_poses_in_a_third_frame_are_the_same_points_wherever_the_frame_stands(sc
         seen.append((*back.apply(np.array(pose[:3]) - camera.position_m), *turn))
     for named, stands in (("", TABLE_IN_BASE), (scene, phantom)):
         goal = ScanGoal(scene=named, poses=seen, frame_id="camera", force_n=0.012)
-        plan, _ = read_goal(goal, frames)
+        plan, _, _ = read_goal(goal, frames)
         assert plan.scene.frame_id == ("phantom" if named else "table")
         points = [(*p.position_m, *p.orientation_xyzw) for p in plan.points]
         for found, pose in zip(in_base(stands, points), places, strict=True):

@@ -1,17 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is touched before the first point of a scan, in which order, and what is left out."""
 
+import shutil
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal
 from tactile_resonance.scan.hands import PointFailed, ScanEnded, Touch
 from tactile_resonance.scan.plan import make_plan
-from tactile_resonance.scan.run_start import UNCHECKED, prepare
-from tactile_resonance.scan.scene import ScanScene
+from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.run_start import UNCHECKED, prepare, start_run
+from tactile_resonance.scan.scene import ScanScene, read_run_scene
 from tactile_resonance.scan.surface import HeightField, NormalRequest, Plane, TouchRequest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from bench_hands import Bench
 
 RADIUS_M = 2.5e-3
 USE = TipUse(TipGeometry(), ContactParameters(), Limits(depth_m=4e-3))
@@ -96,3 +106,31 @@ def test_touches_that_cannot_be_made_refuse_the_scan():
     scene = scene_of(TouchRequest(((0, 0), (1, 0), (0, 1)), "plane"))
     with pytest.raises(ValueError, match=r"surface\.touch: the tip is not moved"):
         prepare(make_plan(scene), RADIUS_M, find, use)
+
+
+def started(path, **goal):
+    """Plan and run of a goal on a bench."""
+    given = ScanGoal(run_directory=str(path), **goal), Frames("table", "base", Pose.at_origin())
+    how = {"seed": 1, "tip_use": None, "tell": lambda _: None, "check": lambda: None}
+    plan, run, _ = start_run(*given, GoalFiles("", ["/"]), Bench(), **how)
+    run.close()
+    return plan, run
+
+
+@pytest.mark.parametrize("named", ["heights.npz", "shapes/heights.npz"])
+def test_a_run_has_the_file_of_its_surface_and_is_resumed_where_the_scene_is_gone(tmp_path, named):
+    scene = tmp_path / "scenes" / "bank.yaml"
+    (scene.parent / named).parent.mkdir(parents=True)
+    np.savez(scene.parent / named, x_m=AXIS, y_m=AXIS, z_m=BANK.z_m)
+    text = f"force_n: 0.01  # as always\nsurface: {{height_field: {{file: {named}}}}}\n"
+    scene.write_text(text + "positions: {list: [[0.05, 0.0], [0.06, 0.0]]}\n")
+    plan, _ = started(tmp_path / "run", scene=str(scene))
+    shutil.rmtree(scene.parent)
+    (tmp_path / "elsewhere").mkdir()
+    moved = (tmp_path / "run").rename(tmp_path / "elsewhere" / "run")
+    assert read_run(moved).problems == ()
+    again, _ = started(moved, resume=True)
+    assert again.points == plan.points
+    np.testing.assert_array_equal(read_run_scene(moved / "scene.yaml").surface.z_m, BANK.z_m)
+    kept = (moved / "scene.yaml").read_text()
+    assert ("as always" in kept) == (named == "heights.npz")  # a scene that names its neighbour stays as it is
