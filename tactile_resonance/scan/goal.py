@@ -98,7 +98,7 @@ def named_frames(goal: ScanGoal, frames: Frames) -> tuple[str, ...]:
 
 
 def read_goal(goal: ScanGoal, frames: Frames) -> tuple[Plan, str, Path | None]:
-    """Plan of the scene that a goal for a new run asks for, that scene as a scene file, and that of its surface.
+    """Plan of the scene that a goal for a new run asks for, that scene as a file, and the file of its surface.
 
     Both with what the goal has in place of the file's; the scene file expects that of its surface beside it.
 

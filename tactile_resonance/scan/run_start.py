@@ -222,6 +222,7 @@ def _resumed(path: Path, frames: Frames, hands: Hands) -> StartedRun:
         accepted = f"{began}, with which the run began, to resume it"
         require(began in (None, contact), "contact", contact, accepted)
         scene = read_run_scene(run.path / "scene.yaml")
+        scene = replace(scene, name=facts.get("name", scene.name))  # else of the file as it was
         _require_force(scene, hands.free_air)
         _require_tests(scene, hands)
         # of an earlier version every scene's frame was the table

@@ -131,6 +131,7 @@ def test_a_run_has_the_file_of_its_surface_and_is_resumed_where_the_scene_is_gon
     assert read_run(moved).problems == ()
     again, _ = started(moved, resume=True)
     assert again.points == plan.points
+    assert again.scene.name == plan.scene.name == "bank"
     np.testing.assert_array_equal(read_run_scene(moved / "scene.yaml").surface.z_m, BANK.z_m)
     kept = (moved / "scene.yaml").read_text()
     assert ("as always" in kept) == (named == "heights.npz")  # a scene that names its neighbour stays as it is
