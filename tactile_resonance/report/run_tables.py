@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from tactile_resonance.fields import counted
 from tactile_resonance.report.point_details import PointTruth, deviation, deviations
 from tactile_resonance.scan.point_outcome import time_budget
-from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.point_result import RESULTS, PointOutcome, PointResult
 
 MOST_ROWS = 500
 """Of a table in a page; a browser takes seconds for ten thousand, and `results.csv` has all."""
@@ -88,21 +89,20 @@ def _row(kind: str, names: Sequence[str], texts: Sequence[str], css: str = "") -
     return f"<tr{css}>{cells}</tr>"
 
 
-def table(names: Sequence[str], rows: Sequence[str]) -> str:
-    """Table of columns with these names; the first `MOST_ROWS` rows, and a sentence on those left out."""
+def table(names: Sequence[str], rows: Sequence[str], all_in: str = "") -> str:
+    """Table of columns with these names: the first `MOST_ROWS` rows, and which file has those left out."""
     head, body = _row("th", names, names), "".join(rows[:MOST_ROWS])
     more = len(rows) - MOST_ROWS
-    told = paragraphs(
-        [f"{more} further rows are left out here; results.csv has all."] if more > 0 else []
-    )
+    left_out = f"{counted(more, 'further row is', 'further rows are')} left out here"
+    told = paragraphs([f"{left_out}; {all_in} has all." if all_in else f"{left_out}."][: more > 0])
     return (
         f'<div class="wide"><table><thead>{head}</thead><tbody>{body}</tbody></table></div>{told}'
     )
 
 
-def text_table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def text_table(names: Sequence[str], rows: Sequence[Sequence[str]], all_in: str = "") -> str:
     """Table of texts, a row each; nothing without one."""
-    return table(names, [_row("td", names, row) for row in rows]) if rows else ""
+    return table(names, [_row("td", names, row) for row in rows], all_in) if rows else ""
 
 
 def results_table(columns: Columns, results: Sequence[PointResult]) -> str:
@@ -113,7 +113,7 @@ def results_table(columns: Columns, results: Sequence[PointResult]) -> str:
         place = f'{css} data-run="0" data-point="{result.index}"'
         rows.append(_row("td", names, [show(result) for _, show in columns], place))
     rows += [""] * (len(results) - len(rows))
-    return table(names, rows)
+    return table(names, rows, RESULTS)
 
 
 def truth_columns(truths: Truths) -> Columns:
@@ -146,7 +146,7 @@ def bands_table(results: Sequence[PointResult]) -> str:
         for result in results
         for band in result.further
     ]
-    return text_table(names, rows)
+    return text_table(names, rows, RESULTS)
 
 
 def distortion_table(results: Sequence[PointResult]) -> str:
@@ -173,7 +173,7 @@ def distortion_table(results: Sequence[PointResult]) -> str:
         for result in results
         for band in result.distortion
     ]
-    return text_table(("point", "band [Hz]", *sides), rows)
+    return text_table(("point", "band [Hz]", *sides), rows, RESULTS)
 
 
 def time_table(results: Sequence[PointResult]) -> str:

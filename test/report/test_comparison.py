@@ -14,6 +14,7 @@ from scipy import stats
 from tactile_resonance.cli import main
 from tactile_resonance.report import comparison
 from tactile_resonance.report.comparison import as_comparison, differences, sentence, unlike
+from tactile_resonance.report.run_tables import COLUMNS, MOST_ROWS, results_table
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.run_content import RunContent, read_run
 
@@ -39,6 +40,14 @@ def drawn(count, seed, shift=(0.0, 0.0), **values):
         PointResult(k, f0_hz=f0, damping_ratio=z, **{"x_m": 1e-3 * k, **columns})
         for k, (f0, z) in enumerate(poles)
     )
+
+
+def test_a_long_table_names_the_file_that_has_all_of_it_where_there_is_one():
+    run = drawn(MOST_ROWS + 1, 1)
+    differing = comparison._differences_table(differences(run, run))
+    assert "<p>1 further row is left out here.</p>" in differing
+    points = results_table(COLUMNS, [*run.latest, replace(run.latest[0], index=len(run.latest))])
+    assert "<p>2 further rows are left out here; results.csv has all.</p>" in points
 
 
 def test_differences_of_equal_runs_are_as_large_as_they_say():
