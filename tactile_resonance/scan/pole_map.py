@@ -296,12 +296,15 @@ class GrowingMap:
             self.add(MapPoint.planned(result))
 
     def clear(self, result: PointResult) -> None:
-        """Leave nothing at the place of a result."""
+        """Leave nothing at the place of a result; of a skipped one nothing of its own point there."""
+        skipped = result.outcome is PointOutcome.SKIPPED
         frame_id, x, y, z = _cell(result)
         place = result.x_m, result.y_m, result.z_m
         for dx, dy, dz in itertools.product((-1, 0, 1), repeat=3):
             for point in tuple(self._at.get((frame_id, x + dx, y + dy, z + dz), ())):
                 other = point.result
+                if skipped and other.index != result.index:
+                    continue  # what another point of the plan found at this place stays
                 if math.dist(place, (other.x_m, other.y_m, other.z_m)) <= SAME_PLACE_M:
                     self._remove(point)
 

@@ -169,6 +169,14 @@ def grown(*points):
     return found
 
 
+def test_a_point_that_is_skipped_takes_nothing_away_that_another_found_at_its_place():
+    """As where one place is planned several times, to see how far its pole scatters."""
+    done = PointResult(0, x_m=0.0, y_m=0.0, z_m=0.0, f0_hz=250.0, measurement_id=1)
+    skipped = replace(done, index=1, f0_hz=np.nan, measurement_id=0, outcome=PointOutcome.SKIPPED)
+    assert [point.result for point in GrowingMap([done, skipped]).map.points] == [done]
+    assert not len(GrowingMap([replace(done, outcome=PointOutcome.FAILED), replace(skipped, index=0)]))
+
+
 def test_a_map_holds_what_a_search_of_all_its_points_would_leave():
     random, found, wanted = np.random.default_rng(4), GrowingMap(), []
     taken = replace(map_point(poles((250.0,)), origin(key=1)).result, measurement_id=0)
