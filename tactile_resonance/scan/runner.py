@@ -45,6 +45,7 @@ from tactile_resonance.scan.point_outcome import (
 )
 from tactile_resonance.scan.point_result import NAN, PointKind, PointOutcome, PointResult
 from tactile_resonance.scan.points import ScanPoint
+from tactile_resonance.scan.run_content import POINT_FILE
 from tactile_resonance.scan.run_directory import PointRecording, RunDirectory, ended_by_storage
 from tactile_resonance.scan.scene import OnFailure, Output
 from tactile_resonance.scan.tissue_tests import ProtocolRequest, fits_of, write_fits
@@ -150,9 +151,8 @@ class ScanRunner:
         request = self._controls.take()
         repeats = request is Request.REPEAT and again is None
         if repeats and (content := self._run.content).results:
-            # by the clock, which may have been set, only of what was finished before
-            latest = max(content.results, key=lambda result: result.time_ns)
-            return self._last or content.points[latest.index]
+            names = (POINT_FILE.fullmatch(file.name) for file in reversed(content.files))
+            return self._last or content.points[next(int(match[1]) for match in names if match)]
         if request is Request.SKIP and point is not None:
             if self._is_done(point):  # to be repeated: what was measured before counts
                 return self._next()

@@ -35,6 +35,7 @@ from tactile_resonance.tissue.nominal_contact import ForceSensitivity, NominalCo
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from bench_hands import AGE_S, BLOCK_S, SPREAD_HZ, TOUCH_S, Bench, begin, scan, scene
+from run_tables import START_NS, record_point
 
 
 def test_each_point_is_measured_until_it_is_precise_enough_and_kept(tmp_path):
@@ -306,6 +307,17 @@ def test_a_clock_that_is_set_back_changes_neither_last_point_nor_latest_attempt_
     ]
     attempts = [(each.index, each.attempt) for each in told if each.kind is PointKind.TISSUE]
     assert attempts == [(0, 0), (1, 0), (1, 1)]
+
+
+def test_the_last_point_of_an_earlier_session_is_the_one_finished_last_whatever_the_clock(tmp_path):
+    controls, bench = Controls(), Bench()
+    plan, run = begin(tmp_path / "run", scene(3))
+    with run:
+        record_point(run, 0)
+        record_point(run, 1, time_ns=START_NS - 3600 * 10**9)  # set back between the two
+        controls.ask(Request.REPEAT)
+        ScanRunner(plan, run, bench, controls, lambda progress: None).run()
+    assert [entry[1] for entry in bench.log if entry[0] == "touch"] == [1, 2]
 
 
 def test_a_paused_scan_waits_with_the_tip_free(tmp_path):
