@@ -12,6 +12,9 @@ import numpy.typing as npt
 
 from tactile_resonance.contact.force_spread import ForceSpread
 
+SIMULATED = "simulated, not measured"
+"""How pages, figures and notes say it."""
+
 
 class InputKind(Enum):
     """How the actuator channel was obtained."""

@@ -6,12 +6,16 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import tactile_resonance as tr
 from tactile_resonance import cli
 from tactile_resonance.multisine import design_multisine
+from tactile_resonance.record import SIMULATED
+from tactile_resonance.report.drawing import draw_analysis
 
 F0_HZ, DAMPING, RATE_HZ, N = 250.0, 0.03, 5000.0, 2000
 
@@ -45,6 +49,13 @@ def good(tmp_path):
     path = tmp_path / "good.npz"
     np.savez(path, **record())
     return path
+
+
+@pytest.mark.parametrize("notes", [(), (SIMULATED,)])
+def test_a_figure_of_a_simulated_record_says_so(notes):
+    recording = replace(tr.make_recording(**record()), notes=notes)
+    figure = draw_analysis(tr.analyse(recording, band_hz=(200.0, 300.0)), "title")
+    assert figure.get_suptitle() == ("title (simulated, not measured)" if notes else "title")
 
 
 def test_json_and_figure_of_a_record(good, tmp_path):

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from tactile_resonance.fields import one_line
 from tactile_resonance.files import PART, sync, write_whole
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.record import Record
+from tactile_resonance.record import SIMULATED, Record
 from tactile_resonance.recording.recording import Recording, make_recording
 
 T = TypeVar("T", Excitation, Record)
@@ -366,6 +366,8 @@ def recording_of(measurement: StoredMeasurement, periods: int | None = None) -> 
 
 def _stated(records: Sequence[Record]) -> Iterator[str]:
     """What records say of themselves that a recording has no field for."""
+    if any(each.origin.simulated for each in records):
+        yield SIMULATED
     for name in ("actuator", "sensor"):
         if any(getattr(each, name).saturated for each in records):
             yield f"{name} saturated"

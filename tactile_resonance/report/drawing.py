@@ -24,6 +24,7 @@ from tactile_resonance.files import write_whole
 from tactile_resonance.frf.distortion import decibel
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.poles.result import ellipse
+from tactile_resonance.record import SIMULATED
 
 if TYPE_CHECKING:  # what is drawn by one command needs libraries that others do without
     from tactile_resonance.analysis import Analysis
@@ -35,7 +36,6 @@ if TYPE_CHECKING:  # what is drawn by one command needs libraries that others do
     from tactile_resonance.tissue.spread import ReferencePoints, SmallestStep, TissueSpread
     from tactile_resonance.tissue.trial import ReliabilityBin
 
-SIMULATED = "simulated, not measured"
 PROBABILITY = 0.95
 """With which an ellipse holds the truth."""
 PAPER_STEP_PERCENT = 2.0
@@ -76,7 +76,8 @@ def _draw_ellipse(
 def draw_analysis(analysis: Analysis, title: str) -> Figure:
     """FRF with its standard deviation, the band with the model, the pole with its ellipse."""
     frf, poles = analysis.frf, analysis.poles
-    figure = new_figure(12, 7.5, title)
+    simulated = f" ({SIMULATED})" if SIMULATED in analysis.warnings else ""
+    figure = new_figure(12, 7.5, title + simulated)
     axes = figure.subplot_mosaic([["whole", "whole", "poles"], ["band", "phase", "poles"]])
 
     whole = axes["whole"]

@@ -28,6 +28,7 @@ import stores
 from stores import assert_same, read_store
 
 STATED = (
+    "simulated, not measured",
     "actuator saturated",
     "the sensor channel is 3.33333e-07 s behind the actuator channel, as the records state: it is taken out "
     "only where channel_delay_s (--channel-delay) gives it",
@@ -217,7 +218,9 @@ def test_a_block_that_was_lost_is_no_early_end(tmp_path):
 def test_what_records_say_of_themselves_is_noted_and_nothing_else():
     excitation = stores.excitations(realisations=1, periods=1)[0]
     record = stores.record(excitation, 0)
-    plain = replace(record, actuator=replace(record.actuator, saturated=False), channel_delay_s=0.0)
+    measured = replace(record.origin, simulated=False)
+    actuator = replace(record.actuator, saturated=False)
+    plain = replace(record, actuator=actuator, channel_delay_s=0.0, origin=measured)
     for channel_delay_s in (0.0, np.nan):
         of = StoredMeasurement.of(7, [excitation], [replace(plain, channel_delay_s=channel_delay_s)], [])
         assert recording_of(of).notes == ()
