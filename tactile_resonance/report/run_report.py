@@ -169,7 +169,8 @@ def warnings_of(
     details: Mapping[int, PointDetails] | None = None,
 ) -> list[str]:
     """What a reader must know before any figure of the run, the gravest first."""
-    scene, results = scene_of(run), run.latest
+    found, results = _scene_or_reason(run), run.latest
+    scene = None if isinstance(found, str) else found
     told = [f"damaged: {problem}" for problem in run.problems[:_MOST_NAMED]]
     if len(run.problems) > _MOST_NAMED:
         more = counted(len(run.problems) - _MOST_NAMED, "further file is", "further files are")
@@ -181,8 +182,11 @@ def warnings_of(
         told.append(
             f"FRF, force or mechanical tests of {counted(len(unread), 'point')} cannot be read: {unread[0]}"
         )
-    if scene is None:
-        told.append("scene.yaml cannot be read: plan and outcome cannot be compared")
+    if isinstance(found, str):
+        told.append(
+            f"{found}: plan and outcome cannot be compared, further bands are left out, and drift "
+            "is judged by the usual limits"
+        )
     if len(results) < len(run.points):
         told.append(
             f"{len(run.points) - len(results)} of {len(run.points)} points are not finished"
@@ -368,10 +372,15 @@ def skipped_lines(run: RunContent) -> list[str]:
 
 def scene_of(run: RunContent) -> ScanScene | None:
     """None where it cannot be read: a run is reported whatever became of its scene."""
+    found = _scene_or_reason(run)
+    return None if isinstance(found, str) else found
+
+
+def _scene_or_reason(run: RunContent) -> ScanScene | str:
     try:
         return read_run_scene(run.path / "scene.yaml")
-    except ValueError:
-        return None
+    except ValueError as error:
+        return str(error)
 
 
 def scene_name(run: RunContent) -> str:

@@ -28,7 +28,7 @@ from tactile_resonance.report.run_report import as_page, warnings_of
 from tactile_resonance.report.run_tables import distortion_table
 from tactile_resonance.scan import tissue_tests
 from tactile_resonance.scan.point_result import BandResult, PointOutcome, PointResult
-from tactile_resonance.scan.run_content import read_run
+from tactile_resonance.scan.run_content import RunContent, read_run
 from tactile_resonance.scan.tissue_tests import fits_at
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -47,6 +47,13 @@ def hostile(tmp_path_factory):
     recorded = scan(scene, folder / "run", failed=(4,))
     assert main(["report", str(folder / "run")]) == 0
     return folder / "run", recorded
+
+
+def test_a_scene_that_cannot_be_read_is_named_with_the_reason(tmp_path):
+    text = "force_n: 0.01\nsurface: {height_field: {file: gone.npz}}\npositions: {list: [[0, 0]]}\n"
+    (tmp_path / "scene.yaml").write_text(text)
+    told = warnings_of(RunContent(tmp_path, "", {}, ()))
+    assert any("gone.npz" in line and "plan and outcome cannot be compared" in line for line in told)
 
 
 class Page(HTMLParser):
