@@ -198,7 +198,7 @@ def run_job(job: Job) -> int:
     from tactile_resonance.commands.plan import read_phantoms
     from tactile_resonance.scan.level_set import LevelSet
     from tactile_resonance.scan.plan import make_plan
-    from tactile_resonance.scan.point_outcome import AFTER
+    from tactile_resonance.scan.point_outcome import AFTER, is_calibrated
     from tactile_resonance.scan.point_result import PointOutcome
     from tactile_resonance.scan.run_directory import RunDirectory
     from tactile_resonance.scan.scene import read_scan_scene
@@ -220,6 +220,10 @@ def run_job(job: Job) -> int:
             print(f"{job.output} is complete: nothing is left to measure")
             report.report_run(job.output)
             return 0 if any(of.outcome is PointOutcome.DONE for of in so_far.latest) else 1
+        # poles of one run are to be of one estimator
+        given, began = job.calibration is not None, is_calibrated(so_far)
+        accepted = "the file with which the run began" if began else "none: the run began without"
+        require(began in (None, given), "--calibration", str(job.calibration or "none"), accepted)
     job = replace(job, host=take_domain(job.host))
     require_own_domain()
     print(

@@ -284,6 +284,23 @@ def calibration_in_air(run: RunContent, calibration: Calibration) -> Validity:
     )
 
 
+def is_calibrated(run: RunContent) -> bool | None:
+    """Whether poles_node had a calibration when a run began, as the first mode found says; None: none was.
+
+    Poles through it name it as their method, others in their message.
+
+    Raises
+    ------
+    ValueError
+        If a file is damaged.
+    """
+    for path in run.paths(POLES_TYPE):
+        poles = last_poles(path)
+        if poles is not None and len(poles.f0_hz):
+            return "calibrated sensor" in f"{poles.method}; {poles.message}"
+    return None
+
+
 def sensor_health(run: RunContent, limits: DriftLimits) -> tuple[SensorHealth, str]:
     """Whether the sensor has drifted between the references of a run.
 

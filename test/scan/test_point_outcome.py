@@ -14,21 +14,26 @@ from tactile_resonance.contact.goal import State
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.run_report import as_page, summary
 from tactile_resonance.scan import point_outcome
+from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.point_outcome import (
     BETWEEN,
     SensorHealth,
     StateTimes,
     budget_sentence,
+    is_calibrated,
     judge_drift,
     relative_to_air,
     sensor_health,
     time_budget,
 )
-from tactile_resonance.scan.point_result import PointOutcome, PointResult
+from tactile_resonance.scan.point_result import POLES_TYPE, PointOutcome, PointResult
+from tactile_resonance.scan.run_directory import RunDirectory
 from tactile_resonance.scan.scene import DriftLimits, Notes, parse_notes
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+import run_tables
 from bench_hands import Bench, scan, scene
+from run_tables import START_NS, plan, record_point
 
 LIMITS = DriftLimits(f0_hz=0.05, damping_ratio=5e-5)
 
@@ -39,6 +44,29 @@ def reference(f0_hz=246.6, damping_ratio=0.012, f0_std_hz=0.002, damping_std=4e-
 
 def mode(estimate, covariance):
     return replace(Poles().main, estimate=estimate, covariance=covariance)
+
+
+@pytest.mark.parametrize(
+    ("method", "message", "calibrated"),
+    [
+        ("joint", "", False),
+        ("calibrated sensor, standard linear solid", "", True),
+        ("joint", "model error; without the calibrated sensor: nothing is touched", True),
+    ],
+)
+def test_a_run_tells_whether_its_poles_come_through_a_calibrated_sensor(
+    tmp_path, method, message, calibrated
+):
+    with RunDirectory.create(tmp_path / "run", "name: x\n", plan(3), {}) as run:
+        record_point(run, 0)
+        assert is_calibrated(run.content) is None
+        for index, modes in enumerate(([], [250.0]), start=1):  # where nothing was estimated nothing is said
+            said = {"method": method, "message": message} if modes else {}
+            poles = make_message(POLES_TYPE, f0_hz=np.array(modes), **said)
+            with run.begin_point(index) as recording:
+                recording.write("/poles", POLES_TYPE, START_NS, to_cdr(poles))
+                recording.finish(run_tables.result(index))
+        assert is_calibrated(run.content) is calibrated
 
 
 def test_uncertainty_relative_to_air_is_that_of_both():
