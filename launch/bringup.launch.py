@@ -135,6 +135,9 @@ def _nodes(context):
         )
         for name, parameters in plan.nodes.items()
     ]
+    if plan.of_others:
+        text = f"params_file: {', '.join(plan.of_others)} hold for none of these nodes, whose names are "
+        nodes.append(LogInfo(msg=f"{text}{', '.join(plan.nodes)}, after the namespace"))
     if not _installed("tf2_ros_py"):
         text = "tf2_ros is not installed here: no frames are broadcast, goals are in table or base"
         nodes.append(LogInfo(msg=text))

@@ -82,11 +82,14 @@ class Bringup:
     simulated_time : bool
         Whether they live in the time of the simulated bench.
     table_frame : str
+    of_others : tuple of str
+        Sections of the file that hold for none of `NODES` here: names misspelt, or another namespace's.
     """
 
     nodes: dict[str, Parameters]
     simulated_time: bool
     table_frame: str
+    of_others: tuple[str, ...] = ()
 
 
 def read_parameter_file(path: str | Path) -> dict[str, Parameters]:
@@ -127,11 +130,15 @@ def stated_for(name: str, sections: Mapping[str, Parameters]) -> Parameters:
     """
     stated: Parameters = {}
     for pattern, parameters in sections.items():
-        absolute = pattern if pattern.startswith("/") else f"/{pattern}"
-        expression = absolute.replace("/*", r"(/\w+)")  # so `/**` is (/\w+)*
-        if re.fullmatch(expression, name):
+        if _matches(pattern, name):
             stated.update(parameters)
     return stated
+
+
+def _matches(pattern: str, name: str) -> bool:
+    absolute = pattern if pattern.startswith("/") else f"/{pattern}"
+    expression = absolute.replace("/*", r"(/\w+)")  # so `/**` is (/\w+)*
+    return re.fullmatch(expression, name) is not None
 
 
 class _Decisions:
@@ -156,6 +163,11 @@ class _Decisions:
     def value(self, node: str, name: str) -> Any:
         """Value that a node receives; None where neither an argument, the file nor a default here sets it."""
         return {**self.stated[node], **self.passed[node]}.get(name)
+
+    def of_others(self) -> tuple[str, ...]:
+        """Sections of the file that hold for none of the nodes."""
+        names = self._names.values()
+        return tuple(s for s in self._sections if not any(_matches(s, name) for name in names))
 
     def check(self, node: str) -> None:
         """``ValueError`` where a later section of the file would override what a node is passed."""
@@ -239,6 +251,7 @@ def plan_bringup(
         nodes={node: plan.passed[node] for node in nodes},
         simulated_time=simulated_time,
         table_frame=table_frame,
+        of_others=plan.of_others(),
     )
 
 

@@ -34,6 +34,17 @@ def heard(arguments, sections=None, namespace="/"):
     }
 
 
+def test_sections_that_hold_for_no_node_are_named():
+    """Misspelt, or without the namespace in which the nodes are: ROS passes them over in silence."""
+    names = ["poles_nod", "poles_node", "/**", "/*/scan_node", "/left/frf_node", "/right/frf_node"]
+    sections = {name: {"order": 4} for name in names}
+    others = ("poles_nod", "/*/scan_node", "/left/frf_node", "/right/frf_node")
+    assert plan_bringup(MOCK, sections).of_others == others
+    assert plan_bringup(MOCK, sections, "/left").of_others == ("poles_nod", "poles_node", "/right/frf_node")
+    known = read_parameter_file(Path(__file__).resolve().parents[1] / "config" / "nodes.yaml")
+    assert plan_bringup(MOCK, known, "/left").of_others == ()
+
+
 @pytest.mark.parametrize(
     ("argument", "given", "parameter", "by_file", "by_default", "nodes"),
     [
