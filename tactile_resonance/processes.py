@@ -265,7 +265,7 @@ def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen:
 
 
 def end_with_parent() -> None:
-    """Let this process, about to be executed, be told to end should its parent die (Linux)."""
+    """Let this process, just begun, be told to end should its parent die (Linux)."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 

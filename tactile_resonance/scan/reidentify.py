@@ -30,6 +30,7 @@ from tactile_resonance.poles.estimator import identify_poles_from_bins
 from tactile_resonance.poles.joint import PoleEstimator
 from tactile_resonance.poles.result import STATUS_CODE, STATUSES, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
+from tactile_resonance.processes import end_with_parent
 from tactile_resonance.scan.kept_bins import (
     PLACE,
     BinsKind,
@@ -295,5 +296,6 @@ def _begin_process() -> None:
     # an interrupt reaches the whole group; the parent ends its processes
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    end_with_parent()  # which cannot where it was killed, as for want of memory
     # The allocator keeps what a process has once used; pages that are new each time take longer than the sums.
     np.ones(4_000_000)

@@ -405,6 +405,18 @@ def test_an_unfinished_file_is_none(tmp_path):
         assert arrays["more"] == "text"
 
 
+def test_a_kill_of_the_command_ends_its_processes():
+    code = "import os\nfrom tactile_resonance.scan import reidentify\nwith reidentify._Processes() as made:\n"
+    code += "    for _ in made.in_order(abs, range(-99, 0)): pass\n    os.write(1, b'up')\n    input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as command:
+        assert command.stdout.read(2) == b"up"
+        command.kill()
+        # to the end of all that could write to it
+        assert command.communicate(timeout=60) == (b"", None)
+
+
 def test_of_two_files_none_is_there_unless_both_fit_on_the_disk(tmp_path, monkeypatch):
     paths = tmp_path / "a", tmp_path / "b"
 
