@@ -156,14 +156,25 @@ class StoredMeasurement:
         records: Iterable[Record],
         problems: Iterable[str],
     ) -> StoredMeasurement:
-        """From excitations and records in any order; of those of one place the last counts."""
+        """From excitations and records in any order; of those of one place the last counts.
+
+        A record whose channels differ in length is none: what follows it would be shifted in one of them.
+        """
         played = {excitation.realisation: excitation for excitation in excitations}
-        taken = {(record.realisation, record.block_index): record for record in records}
+        taken, found = dict[tuple[int, int], Record](), [*problems]
+        for record in records:
+            place = record.realisation, record.block_index
+            u, y = record.actuator.samples.size, record.sensor.samples.size
+            if u == y:
+                taken[place] = record
+            else:
+                which = f"block {place[1] + 1} of realisation {place[0] + 1}"
+                found.append(f"{which}: {u} samples of the actuator, {y} of the sensor, expected as many")
         in_order = (
             tuple(played[m] for m in sorted(played)),
             tuple(taken[at] for at in sorted(taken)),
         )
-        return cls(measurement_id, *in_order, tuple(problems))
+        return cls(measurement_id, *in_order, tuple(found))
 
     @property
     def gaps(self) -> tuple[tuple[int, int], ...]:

@@ -215,6 +215,21 @@ def test_a_block_that_was_lost_is_no_early_end(tmp_path):
     assert found.notes == (lost, *STATED)
 
 
+def test_a_block_whose_channels_differ_in_length_is_lost_and_shifts_nothing(tmp_path):
+    _, records = stores.write(RecordStore(tmp_path), 7, realisations=1, periods=4)
+    excitation = stores.excitations(realisations=1, periods=4)[0]
+    short = replace(records[2].sensor, samples=records[2].sensor.samples[:-1])
+    cut = [*records[:2], replace(records[2], sensor=short), records[3]]
+    found = recording_of(StoredMeasurement.of(7, [excitation], cut, []))
+    np.testing.assert_array_equal(found.y[0], [record.sensor.volts() for record in records[:2]])
+    n = stores.SAMPLES
+    differ = f"block 3 of realisation 1: {n} samples of the actuator, {n - 1} of the sensor, expected as many"
+    assert found.notes[:2] == (
+        differ,
+        "2 of 4 consecutive periods are used: block 3 of realisation 1 is missing",
+    )
+
+
 def test_what_records_say_of_themselves_is_noted_and_nothing_else():
     excitation = stores.excitations(realisations=1, periods=1)[0]
     record = stores.record(excitation, 0)
