@@ -33,7 +33,13 @@ from tactile_resonance.tissue.nominal_contact import (
     NominalContact,
     sensitivity_of_preloads,
 )
-from tactile_resonance.tissue.spread import DEGREES_DIGITS, LEVELS, SpreadSource, TissueSpread
+from tactile_resonance.tissue.spread import (
+    DEGREES_DIGITS,
+    FEWEST_DEGREES,
+    LEVELS,
+    SpreadSource,
+    TissueSpread,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +184,10 @@ def with_library(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
     alone, accepted = "nominal_contact" not in content, f"none: it belongs to the classes, in {name}"
     require(alone, f"{where} nominal_contact", "one", accepted)
     library = read_yaml(path.parent / name)
-    parse_classes(library.get("tissue_classes"), f"{name}: tissue_classes")
+    for tissue in parse_classes(library.get("tissue_classes"), f"{name}: tissue_classes"):
+        degrees = tissue.degrees_of_freedom + 1  # of the estimate: see `predictive_class`
+        accepted = f"{FEWEST_DEGREES} or more: made by `references build` of more preparations, or pooled"
+        require(degrees >= FEWEST_DEGREES, f"{name}: {tissue.name}.degrees_of_freedom", degrees, accepted)
     parse_nominal_contact(library, f"{name}:")
     sections = ("tissue_classes", "nominal_contact")
     return {**content, **{key: library[key] for key in sections if key in library}}
