@@ -331,11 +331,11 @@ def _json(content: dict) -> bytes:
 def _pressed(
     options: argparse.Namespace, run: RunContent | None
 ) -> Iterator[tuple[int | None, str, float, float]]:
-    """Measurement, name, force and its deviation [N] of each record that is asked for."""
+    """Measurement, name, force and its deviation [N] of each record: that asked for, or all that count."""
     wanted = options.measurement_id
     given = (float("nan") if options.force_n is None else options.force_n), 0.0
-    points = [] if run is None else [of for of in run.results if of.blocks]
-    points = [of for of in points if wanted in (None, of.measurement_id)]
+    attempts = () if run is None else run.latest if wanted is None else run.results
+    points = [of for of in attempts if of.blocks and wanted in (None, of.measurement_id)]
     for of in points:
         own = options.force_n is None and np.isfinite([of.force_n, of.force_std_n]).all()
         force = (of.force_n, of.force_std_n) if own else given

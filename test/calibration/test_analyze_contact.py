@@ -3,6 +3,8 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +15,9 @@ from benchmarks.calibrate_benches import BAND_HZ, excitation
 from tactile_resonance.calibration.contact import ContactStatus, Law
 from tactile_resonance.calibration.model import CalibratedSensor
 from tactile_resonance.cli import main
+from tactile_resonance.commands.analyze import _pressed
+from tactile_resonance.scan.point_result import PointResult
+from tactile_resonance.scan.run_content import RunContent
 from tactile_resonance.simulation.sensor.bimorph import couple
 
 FORCE_N = 0.01
@@ -96,6 +101,14 @@ def test_a_contradicted_calibration_falls_back_and_says_so(bench, library, senso
     assert any("without the calibration" in text for text in found.warnings)
     true = couple(bench.sensor, wet).mode_near(250.0)
     assert abs(found.poles.main.f0_hz - true.f0_hz) < 0.2
+
+
+def test_of_a_run_each_point_is_analysed_once_and_an_earlier_attempt_where_it_is_asked_for():
+    attempts = (PointResult(0, 0, blocks=3, measurement_id=7), PointResult(0, 1, blocks=3, measurement_id=8))
+    run = RunContent(Path("run"), "", {}, (), results=(*attempts, PointResult(1, blocks=3, measurement_id=9)))
+    for asked, found in ((None, [8, 9]), (7, [7]), (8, [8])):
+        options = SimpleNamespace(measurement_id=asked, force_n=None, record="run")
+        assert [key for key, *_ in _pressed(options, run)] == found
 
 
 def test_the_command_prints_and_writes_the_contact(bench, library, sensor_file, tmp_path, capsys):
