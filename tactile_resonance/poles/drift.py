@@ -25,6 +25,7 @@ from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData, rough_noise, with_noise
 from tactile_resonance.poles.fit import Linearised
 from tactile_resonance.poles.joint import JointPlan
+from tactile_resonance.poles.joint_fit import noise_of_moving_modes
 from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.likelihood import moments
 from tactile_resonance.poles.modes import propagated
@@ -347,7 +348,7 @@ def poles_with_drift(
         alone = np.any(gain > MOST_OF_GAIN * change / np.abs(pole_rad_s))
         alone &= found[2].chance(drift, slice(none.size)) < FALSE_ALARM
         if alone or found[2].chance(drift) < ONE_MORE:
-            poles = _result(*found)
+            poles = _result(*found, y)
             if alone:
                 poles = _changed(poles, GAIN_TOO)
             elif modes.left_out(drift) > MOST_LEFT_OUT:
@@ -364,20 +365,24 @@ def _changed(poles: Poles, reason: str) -> Poles:
     return changed.noting(reason)
 
 
-def _result(modes: DriftingModes, drift: FloatArray, at: _Step) -> Poles:
-    """`Poles` of a fit to a record without its drift (rows, m, 2), which is not known better than it is."""
+def _result(modes: DriftingModes, drift: FloatArray, at: _Step, y: ComplexArray) -> Poles:
+    """`Poles` of a fit to a record y (K,) without its drift (rows, m, 2), which is not known better than it is.
+
+    What the polynomials do not describe is noise at the mode, in all that is stated.
+    """
     plan, fit, there = modes.plan, modes.fit, modes.there
-    covariance = at.covariance
+    factor = noise_of_moving_modes(plan, modes.u, y - modes.added(drift), modes.theta)
+    covariance = factor * at.covariance
     added = at.coefficients @ covariance @ at.coefficients.T
     pole = fit.poles_rad_s
     sensitivity = fit.fit.residues_and_sensitivity(pole)[1]
     more, in_f0 = (of[0] for of in propagated(pole[None], sensitivity[None], added[None]))
     fit = replace(
         fit,
-        coefficient_covariance=fit.coefficient_covariance + added,
-        pole_covariance=fit.pole_covariance + more,
-        covariance=fit.covariance + in_f0,
-        total_covariance=fit.total_covariance + in_f0,
+        coefficient_covariance=factor * fit.coefficient_covariance + added,
+        pole_covariance=factor * fit.pole_covariance + more,
+        covariance=factor * fit.covariance + in_f0,
+        total_covariance=fit.total_covariance + (factor - 1) * fit.covariance + in_f0,
     )
     samples = plan.samples_per_period * plan.periods
     # the first polynomial is the straight line nearest to the change

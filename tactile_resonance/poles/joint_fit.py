@@ -341,6 +341,29 @@ def _mean_power(data: BinData) -> FloatArray:
     return np.asarray(np.mean(y.real**2 + y.imag**2, axis=(1, 2)))
 
 
+def noise_of_moving_modes(
+    plan: JointPlan, u: ComplexArray, y: ComplexArray, theta: FloatArray
+) -> float:
+    """Factor of the covariance of a fit to one record, for noise at its modes that the fit does not count.
+
+    Such noise passes for flat in few bins; a mode that moves makes it.
+
+    Parameters
+    ----------
+    plan : JointPlan
+        Of several periods.
+    u, y : (K,) complex
+    theta : (n,) float
+        The fit.
+    """
+    plain = BinData.of(y[None, None], u[None, None], plan.order, plan.others_at.size)
+    fitted = _Round.weighted_with_noise(plan, plain, theta[None, None])
+    if fitted.kind[0] > 0 or not _may_return(fitted.solution)[0]:
+        return 1.0
+    scale, *_ = level_of(plan, fitted.solution, fitted.noise, np.zeros(1, bool))
+    return float(noise_at_modes(plan, fitted.data, fitted.solution, scale)[0])
+
+
 def _several(first: _Round) -> Judged:
     """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own."""
     changed = np.flatnonzero(_weighted_wrongly(first) & first.solution.plain)
