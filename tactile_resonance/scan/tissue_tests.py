@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,9 @@ BESIDE_S = 30.0
 MECHANICS = "mechanics.csv"
 AT_S = (0.5, 1.0, 10.0, 60.0)
 """Times after a step at which moduli are listed [s]."""
+REMEMBERS = (
+    "follows {} at this place: what the tissue remembers of it is neither in the model nor in the deviations"
+)
 _OF_COURSE = ("ramp_s", "hold_s", "peak_force_n", "relaxed_share")  # fields of a fit
 
 
@@ -163,7 +166,12 @@ def fits_at(run: RunContent, result: PointResult, **options: Any) -> tuple[Tissu
     """
     messages = read_messages(file_of(run.path, result), TYPE)
     records = [indentation_from_message(message, result.label) for _, _, message in messages]
-    return tuple(fitted(record, result, **options) for record in records)
+    found = [fitted(record, result, **options) for record in records]
+    for k, one in enumerate(found):
+        if one.fit is not None:
+            told = REMEMBERS.format("another test" if k else "the contact of the poles")
+            found[k] = replace(one, fit=replace(one.fit, status=(*one.fit.status, told)))
+    return tuple(found)
 
 
 def fits_of(run: RunContent, **options: Any) -> Iterator[TissueTest]:

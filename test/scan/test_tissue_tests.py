@@ -28,6 +28,7 @@ from tactile_resonance.scan.tissue_tests import ProtocolRequest, fits_at, fits_o
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from bench_hands import Bench, scan, scene
 
+POLES = "the contact of the poles"
 SOLID = Prony(3e3, np.array([2e3]), np.array([1.5]))
 RELAXATION = ProtocolRequest(Protocol.RELAXATION, hold_s=8.0, points=(2,))
 CREEP = ProtocolRequest(Protocol.CREEP, hold_s=4.0, force_n=0.012, points=(2, 3))
@@ -71,6 +72,8 @@ def test_tests_follow_the_poles_of_their_points_and_stand_in_their_files(tmp_pat
     kinds = [(row["point"], row["protocol"]) for row in rows]
     assert kinds == [("2", "relaxation"), ("2", "creep"), ("3", "creep")]
     assert float(rows[0]["modulus_1s_pa"]) == value
+    followed = [row["status"].split(" at this place")[0] for row in rows]
+    assert followed == [f"follows {what}" for what in (POLES, "another test", POLES)]
     assert fits_at(run, run.latest[0]) == ()
     for options in (["--rigid"], ["--radius-m", "0.002"], ["--protocol", "creep"]):
         assert main(["mechanics", str(run.path), *options]) == 1
