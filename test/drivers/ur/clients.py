@@ -60,7 +60,9 @@ class Clients:
         if seconds is None:
             self.clock.free(Demand.REAL)
         else:
-            self.clock.hold(self.clock.ask_ns() + round(seconds * 1e9), Demand.REAL)
+            self.clock.hold(0, Demand.REAL, 0)
+            limit_ns = self.clock.ask_ns() + round(seconds * 1e9)
+            self.clock.hold(limit_ns, Demand.REAL, 1)  # from when the robot has the call
         try:
             yield
         finally:

@@ -100,6 +100,36 @@ def test_the_bench_is_told_how_many_packets_are_on_their_way():
     ]  # fmt: skip
 
 
+def test_the_watchdog_is_set_within_the_time_that_it_allows_however_late_that_is_said():
+    """Time that reached its limit before the robot has the command would stand for ever."""
+    pytest.importorskip("rtde_control", reason="ur_rtde is not installed")
+    from tactile_resonance.drivers.ur_session import Session
+
+    config, now_ns, said = UrArmConfig("127.0.0.1"), 10**10, []
+    limit_ns = now_ns + round(0.75e9 / config.watchdog_hz)
+    session = Session(
+        config,
+        SimpleNamespace(
+            hold=lambda *how: said.append(how),
+            ask_ns=lambda: now_ns,
+            sleep_until=lambda time_ns: None,
+        ),
+    )
+    session.control = SimpleNamespace(
+        setTcp=lambda tip: True,
+        getTCPOffset=lambda: config.tip_in_flange.vector.tolist(),
+        setPayload=lambda *_: True,
+        setWatchdog=lambda hz: said.append(hz) or True,
+        kickWatchdog=lambda: True,
+    )
+    session._prepare()
+    stands = (0, Demand.REAL, 0)  # while the limit is asked for
+    assert said == [
+        *(stands, (limit_ns, Demand.REAL, 1), config.watchdog_hz),
+        *(stands, (limit_ns, Demand.REAL, 0)),
+    ]
+
+
 def test_time_stands_between_two_words_of_the_loop(robot, high):
     tick(high)
     first = high.state()
