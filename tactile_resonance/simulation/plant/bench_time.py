@@ -179,7 +179,7 @@ class BenchTime:
 
     def tell_reached(self) -> None:
         """Report the time to those that wait for it; end a conductor's `go` where a result is handed over."""
-        for participant in self._participants:
+        for participant in list(self._participants):  # who is found gone leaves the list
             if participant.wake_ns <= self.now_ns:
                 participant.wake_ns = ENDLESS_NS
                 participant.tell(FromBench.TOLD, self.now_ns)

@@ -6,10 +6,19 @@ import itertools
 import math
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
-from tactile_resonance.clock import ENDLESS_NS, ClockLostError, Demand, SimulatedClock, time_address
+from tactile_resonance.clock import (
+    ENDLESS_NS,
+    MESSAGE,
+    ClockLostError,
+    Demand,
+    SimulatedClock,
+    ToBench,
+    time_address,
+)
 from tactile_resonance.simulation.plant import bench_time
 from tactile_resonance.simulation.plant.bench_time import START_NS, BenchTime
 from tactile_resonance.simulation.ur5e.reactor import Reactor
@@ -193,6 +202,24 @@ def test_a_sleeper_is_told_and_holds_nothing(bench, conductor):
     thread.join(PATIENCE_S)
     assert woken_ns
     assert begun_ns + 5 * STEP_NS <= sleeper.now_ns() <= begun_ns + 40 * STEP_NS
+
+
+def test_who_is_found_gone_as_it_is_told_keeps_nobody_else_from_being_told():
+    bench, told = BenchTime(Reactor(HOST), STEP_NS, simulated=True), []
+
+    def join(name, send):
+        serving = bench.serve(SimpleNamespace(send=send))
+        next(serving)
+        serving.send(b'{"name": "%s"}\n' % name)
+        until_ns = START_NS + STEP_NS
+        serving.send(MESSAGE.pack(ToBench.HOLD, until_ns, Demand.FAST, -1))
+        return serving
+
+    gone = join(b"gone", lambda data: gone.close())  # as a connection that cannot be written to
+    loop = join(b"loop", told.append)
+    bench._step()
+    assert [MESSAGE.unpack(data)[1] for data in told] == [START_NS + STEP_NS]
+    loop.close()
 
 
 def test_a_step_waits_for_packets_that_are_said_to_be_on_their_way(bench, conductor):
