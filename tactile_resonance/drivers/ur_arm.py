@@ -91,6 +91,7 @@ class UrArm:
         self._sent: deque[tuple[int, bytes, float]] = deque()
         self._refused = 0
         self._looked_ns = 0
+        self._found_playing = False  # a program, before ours was started
         self._reading = threading.Lock()
 
     # properties
@@ -271,6 +272,7 @@ class UrArm:
             trip_s = 0.0 if self.time_server else stream.round_trip_s
             self._states = StateReader(stream, lambda: self.clock.now_ns(), trip_s)
             self._wait_for(lambda states: states.newest is not None, "no state of the robot comes")
+            self._found_playing = self._reader.newest.runtime_state == PROGRAM_PLAYING
             self._check_stop()
         except ConnectionError as error:
             self._forget()
@@ -322,7 +324,7 @@ class UrArm:
             client.ask((name, *arguments), self.receive)
         except ArmError as error:
             client.end()
-            runs = self._states is not None and self._states.newest is not None
+            runs = self._found_playing and self._states is not None
             runs = runs and self._states.newest.runtime_state == PROGRAM_PLAYING
             self._forget()
             if name == "connect" and "not ready" in str(error) and runs:

@@ -14,7 +14,12 @@ import pytest
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.drivers.rtde_stream import RobotState, StateReader, motion_fault
+from tactile_resonance.drivers.rtde_stream import (
+    PROGRAM_PLAYING,
+    RobotState,
+    StateReader,
+    motion_fault,
+)
 from tactile_resonance.drivers.ur_arm import UrArm
 from tactile_resonance.drivers.ur_config import UrArmConfig, read_ur_config
 from tactile_resonance.drivers.ur_exchange import (
@@ -399,3 +404,19 @@ def test_a_connection_that_another_thread_closes_is_lost_and_the_new_one_stays()
     assert error.value.fault is ArmFault.LINK_LOST
     assert arm._states is later
     assert later.stream.fileno() >= 0
+
+
+@pytest.mark.parametrize("found_playing", [True, False])
+def test_of_two_programs_only_the_one_that_was_there_before_is_called_another(found_playing):
+    """That which was found does not end; of ours it is not known what it waits for."""
+
+    def late(*_):
+        raise ArmError(ArmFault.LINK_LOST, "127.0.0.1 is not ready after 15 s")
+
+    arm, reader = UrArm(UrArmConfig("127.0.0.1")), Reader(1.0)
+    reader.newest.runtime_state = PROGRAM_PLAYING
+    arm._states, arm._found_playing = reader, found_playing
+    with pytest.raises(ArmError, match="not ready after 15 s") as error:
+        arm._ask("connect", of=SimpleNamespace(ask=late, end=lambda: None))
+    assert ("another program" in str(error.value)) is found_playing
+    assert error.value.fault is (ArmFault.PROGRAM_NOT_STARTED if found_playing else ArmFault.LINK_LOST)
