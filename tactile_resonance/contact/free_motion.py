@@ -260,6 +260,7 @@ class Withdrawal:
         self._felt_from: tuple[float, float] | None = None  # height and force
         self._step: tuple[float, list[float]] | None = None  # where it begins, and its forces
         self._left_n = math.nan  # at the standoff
+        self._left_m = math.inf  # height of the tip when that was looked into
         self._zero_moved = False  # once in a contact
         self._before_n = math.nan  # mean of the last step
 
@@ -364,7 +365,7 @@ class Withdrawal:
                 self.zero_n = mean_n if tared else None
                 return Move(None, State.IDLE)
             self._step, self._before_n = (height_m, []), math.nan
-            self._felt_s = 0.0
+            self._left_m, self._felt_s = height_m, 0.0
         self._felt_s += self._parameters.period_s
         if self._felt_s <= FEEL_NOT_S:
             self._left_n = self._smooth_n
@@ -384,7 +385,7 @@ class Withdrawal:
                 self.zero_n = now_n if tared else None
                 return Move(None, State.IDLE)
             self._step, self._before_n = (height_m, []), now_n
-        if height_m - self._free.clear_m > BEYOND_M:
+        if height_m - self._left_m > BEYOND_M:
             if not tared:  # a source that is not steady enough for a zero says no more
                 return Move(None, State.IDLE)
             text = f"the force still changes {1e3 * height_m:.0f} mm above the surface"

@@ -179,6 +179,28 @@ def test_zero_that_crept_in_the_hold_does_not_keep_the_tip_for_good(rate_n_per_s
         assert made.force_n[-1] == 0.0
 
 
+def test_a_tip_that_was_held_far_up_comes_free_once_its_force_is_steady():
+    """Each request looks into the force anew, from where the tip is."""
+    made = started()
+    assert made.run_until(State.HOLD)
+    made.controller.retract()
+    made.loop.cycle()
+    faults, creep_n = made.bench.cell.faults, [-8e-3 * QUICK.period_s]
+
+    def creep():
+        faults.bias_step_n += creep_n[0]
+
+    made.bench.clock.on_step.append(creep)
+    assert made.run_until(State.FAULT, 8.0)
+    assert "still changes" in made.controller.result.message
+    creep_n[0] = 0.0
+    place_m = made.bench.clock.motion.reported.position_m[2]
+    made.controller.retract()
+    assert made.run_until(State.IDLE, 3.0), made.controller.result.message
+    assert made.controller.result.retracted
+    assert 0 < made.bench.clock.motion.reported.position_m[2] - place_m < 5e-3
+
+
 def test_no_room_above_the_standoff_is_said_and_ends():
     limits = Limits(workspace=Workspace((-1.0, -1.0, -0.2), (1.0, 1.0, RADIUS_M + 2.7e-3)))
     made = contact(limits=limits, start_m=2.2e-3)
