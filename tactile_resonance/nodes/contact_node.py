@@ -17,7 +17,13 @@ from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceInfo, NodeArm
 from tactile_resonance.contact.loop import Cycle, IndentationRecorder
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.result import Cause, ContactResult, not_reached, refusal_cause
+from tactile_resonance.contact.result import (
+    Cause,
+    ContactResult,
+    NotIdleError,
+    not_reached,
+    refusal_cause,
+)
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import check_not_negative
 from tactile_resonance.mechanics.indentation import BallTip, Protocol
@@ -270,11 +276,11 @@ class ContactNode(ManagedNode):
         """What became of a goal, and its test; None: it has none, was not begun, or the node was stopped."""
         try:
             if self._thread is None:
-                raise ValueError("contact_node is not active")
+                raise NotIdleError("contact_node is not active")
             if self._goal is not None:
-                raise ValueError("goal: refused while another one is under way")
+                raise NotIdleError("goal: refused while another one is under way")
             if self._stop.stopped:
-                raise ValueError("goal: refused while the tip is stopped")
+                raise NotIdleError("goal: refused while the tip is stopped")
             limits = self._settings.limits.lowered(
                 abort_force_n=goal.request.abort_force_n or None,
                 depth_m=goal.request.depth_limit_m or None,

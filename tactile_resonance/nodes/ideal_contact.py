@@ -132,7 +132,7 @@ class IdealContact:
         goal = contact_goal(request, self._base_frame, self._tip.ball_radius_m)
         check_goal(goal, *read_contact())
         if self._stop.stopped:
-            raise ValueError("goal: refused while the tip is stopped")
+            raise NotIdleError("goal: refused while the tip is stopped")
         if self._state is not State.IDLE:
             raise NotIdleError(f"goal: refused in state {self._state.value}; accepted in idle")
 

@@ -23,6 +23,7 @@ from tactile_resonance.contact.parameters import (
     ranges_of,
     read_contact,
 )
+from tactile_resonance.contact.result import Cause
 from tactile_resonance.nodes import contact_node
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
@@ -138,6 +139,27 @@ def test_other_requests_are_served_while_the_program_of_an_arm_is_started_again(
     executor.remove_node(node)
     assert asked == [True, "retract"]
     assert task.result().startswith("asked")
+
+
+@pytest.mark.parametrize(
+    ("active", "another", "stopped", "message"),
+    [
+        (False, None, False, "contact_node is not active"),
+        (True, "a goal", False, "goal: refused while another one is under way"),
+        (True, None, True, "goal: refused while the tip is stopped"),
+    ],
+)
+def test_an_accepted_goal_that_has_to_wait_is_busy_and_not_wrong(
+    launch, active, another, stopped, message
+):
+    """What comes between its acceptance and its begin: a scan repeats its point."""
+    node = launch()
+    node._thread, node._goal, node._stop.stopped = object() if active else None, another, stopped
+    with pytest.raises(StopIteration) as ended:
+        node._outcome_of(SimpleNamespace(request=None)).send(None)
+    result, _ = ended.value.value
+    assert (result.reached, result.cause, result.message) == (False, Cause.BUSY, message)
+    node._thread = None
 
 
 @pytest.mark.parametrize("ends", [True, False])
