@@ -16,7 +16,12 @@ from rclpy.node import Node
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
+from tactile_resonance.drivers.acquisition import (
+    AcquiredBlock,
+    AcquisitionDevice,
+    DeviceError,
+    DeviceInfo,
+)
 from tactile_resonance.fields import counted
 from tactile_resonance.multisine import Excitation, Grid, compress_crest_factor, design_multisine
 from tactile_resonance.nodes import devices
@@ -163,22 +168,24 @@ class ExcitationNode(ManagedNode):
             return Measure.Result(outcome=Measure.Result.NOT_READY, message=busy)
         self._cancelled.clear()
         self._measured = goal
+        device = self._device  # of this configuration: the node may have another one before this ends
         try:
-            result = await in_thread(self, lambda: self._measure(goal), "measure")
+            result = await in_thread(self, lambda: self._measure(goal, device), "measure")
         finally:
-            self._measured = None
+            if self._measured is goal:
+                self._measured = None
         # in this thread and at once: a goal that is over may expire before its result is taken
         end = {Measure.Result.DONE: goal.succeed, Measure.Result.CANCELLED: goal.canceled}
         end.get(result.outcome, goal.abort)()
         return result
 
-    def _measure(self, goal: ServerGoalHandle) -> Measure.Result:
+    def _measure(self, goal: ServerGoalHandle, device: AcquisitionDevice) -> Measure.Result:
         result = Measure.Result(outcome=Measure.Result.REFUSED)
         try:
-            excitations = self._plan(goal.request)
+            excitations = self._plan(goal.request, device)
             result.measurement_id = excitations[0].measurement_id
             result.outcome = Measure.Result.NOT_READY  # a device that does not answer may do so later
-            info = self._device.configure(excitations[0].sample_rate_hz)
+            info = device.configure(excitations[0].sample_rate_hz)
             result.outcome = Measure.Result.REFUSED
             check_output(excitations, info)
             store = self._open_store()
@@ -187,7 +194,7 @@ class ExcitationNode(ManagedNode):
             planned = sum(excitation.periods for excitation in excitations)
             result.outcome = Measure.Result.FAILED  # what an error means from now on
             for excitation in excitations:
-                self._play(goal, excitation, info, store, result, planned)
+                self._play(goal, device, excitation, info, store, result, planned)
             result.outcome = Measure.Result.DONE
         except Cancelled:
             result.outcome = Measure.Result.CANCELLED
@@ -204,11 +211,11 @@ class ExcitationNode(ManagedNode):
             result.message = self.health.failed("measurement", error)
         return result
 
-    def _plan(self, goal: Measure.Goal) -> list[Excitation]:
+    def _plan(self, goal: Measure.Goal, device: AcquisitionDevice) -> list[Excitation]:
         """What the device will play, with ids where neither goal nor device gives any."""
         asked = design(self, goal, self._measurements)
         self._measurements += 1
-        planned = self._device.plan(asked)
+        planned = device.plan(asked)
         measurement_id = planned[0].measurement_id or self._new_id()
         return [
             replace(
@@ -236,6 +243,7 @@ class ExcitationNode(ManagedNode):
     def _play(
         self,
         goal: ServerGoalHandle,
+        device: AcquisitionDevice,
         excitation: Excitation,
         info: DeviceInfo,
         store: RecordStore | None,
@@ -254,11 +262,11 @@ class ExcitationNode(ManagedNode):
             excitation_to_message(excitation, self.ros_now_ns(), self._frame_id)
         )
         try:
-            self._device.arm(excitation)
-            self._device.play()
+            device.arm(excitation)
+            device.play()
             for _ in range(excitation.periods):
                 try:
-                    block = self._read_block(timeout_s)
+                    block = self._read_block(device, timeout_s)
                 except DeviceError as error:
                     if self._cancelled.is_set():
                         raise Cancelled from error
@@ -276,14 +284,14 @@ class ExcitationNode(ManagedNode):
                 if not self.active:
                     raise DeviceError("device: stopped, the node was deactivated")
         finally:
-            self._device.stop()
+            device.stop()
 
-    def _read_block(self, timeout_s: float) -> AcquiredBlock:
+    def _read_block(self, device: AcquisitionDevice, timeout_s: float) -> AcquiredBlock:
         # in simulated time a block takes as long as it takes
         if not self.time_server:
             self._read_by_s = time.monotonic() + timeout_s + HUNG_S
         try:
-            return self._device.read_block(timeout_s)
+            return device.read_block(timeout_s)
         finally:
             self._read_by_s = float("inf")
 

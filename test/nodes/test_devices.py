@@ -27,7 +27,7 @@ from tactile_resonance.srv import ForceOver
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.drivers.acquisition import DeviceError
-from tactile_resonance.nodes import devices
+from tactile_resonance.nodes import devices, excitation_node
 from tactile_resonance.nodes.devices import FORCE_WITHIN_S
 from tactile_resonance.nodes.excitation_node import ExcitationNode
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
@@ -116,11 +116,58 @@ def test_what_an_error_means_is_a_matter_of_how_far_the_measurement_came(
         node = ExcitationNode()
         node.trigger_configure()
         node.trigger_activate()
-        result = node._measure(SimpleNamespace(request=Measure.Goal(level_v=0.1)))
+        result = node._measure(SimpleNamespace(request=Measure.Goal(level_v=0.1)), node._device)
         node.destroy_node()
     assert result.outcome == outcome
     expected = f"device: cannot {raises}" if raises else "level_v: peak"
     assert result.message.startswith(expected)
+
+
+def test_a_measurement_of_a_former_configuration_leaves_the_present_one_alone(monkeypatch, tmp_path):
+    """It ends when its device, which was closed, comes back from a block; another may be under way by then."""
+
+    async def at_once(node, work, name):
+        return work()
+
+    class Device:
+        info = SimpleNamespace(name="a device", output_peak_v=math.inf)
+
+        def __init__(self):
+            self.asked = []
+
+        def __getattr__(self, name):
+            def call(*given):
+                self.asked.append(name)
+                return self.info if name == "configure" else given[0] if given else None
+
+            return call
+
+        def read_block(self, timeout_s):
+            node.trigger_deactivate()
+            node.trigger_cleanup()
+            node.trigger_configure()
+            node.trigger_activate()
+            node._measured = "another goal"
+            raise DeviceError("device: closed")
+
+    made, ended = [], []
+    monkeypatch.setattr(devices, "make_device", lambda _: (made.append(Device()) or made[-1], ()))
+    monkeypatch.setattr(excitation_node, "in_thread", at_once)
+    given = ["--ros-args", "-p", f"record_folder:={tmp_path}"]
+    with initialised(args=given, domain_id=free_domain_id(os.environ)):
+        node = ExcitationNode()
+        node.trigger_configure()
+        node.trigger_activate()
+        goal = SimpleNamespace(request=Measure.Goal(level_v=0.1), succeed=None, canceled=None)
+        goal.abort = lambda: ended.append(goal)
+        with pytest.raises(StopIteration):
+            node._on_goal(goal).send(None)
+        measured, present = node._measured, list(made[1].asked)
+        node.destroy_node()
+    assert ended == [goal]
+    assert measured == "another goal"
+    assert made[0].asked[-2:] == ["close", "stop"]
+    assert present == []
 
 
 def test_records_go_where_the_parameter_says(tmp_path):
@@ -332,7 +379,7 @@ def test_where_nobody_measures_the_force_the_place_is_what_is_told():
 def test_a_measurement_that_a_defect_ends_is_not_done():
     told = []
     health = SimpleNamespace(failed=lambda what, error: told.append(what) or repr(error))
-    node = SimpleNamespace(_plan=lambda goal: {}["what nobody thought of"], health=health)
-    result = ExcitationNode._measure(node, SimpleNamespace(request=Measure.Goal()))
+    node = SimpleNamespace(_plan=lambda *_: {}["what nobody thought of"], health=health)
+    result = ExcitationNode._measure(node, SimpleNamespace(request=Measure.Goal()), None)
     assert (result.outcome, result.blocks) == (Measure.Result.FAILED, 0)
     assert (result.message, told) == ("KeyError('what nobody thought of')", ["measurement"])
