@@ -195,8 +195,8 @@ class ManagerNode(Node):
         node.refusals += 1
         node.next_try_s = now_s + wait_s
         self.health.error(
-            f"{node.name} refuses to come up (its log and /diagnostics say why), "
-            f"asked again in {wait_s:g} s"
+            f"{node.name} refuses to {'come up' if self._wanted_up else 'go down'} "
+            f"(its log and /diagnostics say why), asked again in {wait_s:g} s"
         )
 
     def _see(self, node: _Managed, state: int) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from rclpy.action.server import ServerGoalHandle
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from tactile_resonance import msg
 from tactile_resonance.action import CalibrateTable, Scan
@@ -129,6 +130,13 @@ class ScanNode(ManagedNode):
         """End the scan after retracting; its points stay finished."""
         self._goals.forget_rejection()
         self._goals.cancel()
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As every node, once the scan has ended: without its clients it could not draw the tip back."""
+        if self._goals.handle is not None:
+            self.health.error("not cleaned up yet: a scan that is to end draws the tip back")
+            return TransitionCallbackReturn.FAILURE
+        return super().on_cleanup(state)
 
     def details(self) -> dict[str, str]:
         """The scan under way."""

@@ -15,6 +15,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.task import Future
 from tactile_resonance.action import Scan
@@ -127,6 +128,17 @@ def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(s
         assert outcome.ending is Ending.REJECTED
         assert reason in outcome.message
         assert not new.exists()
+
+
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_a_node_is_not_cleaned_up_before_its_scan_has_ended(stack):
+    stack.activate()
+    scan = stack.begin([])
+    assert stack.scan_node.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
+    assert stack.scan_node.trigger_cleanup() is TransitionCallbackReturn.FAILURE
+    assert stack.scan_node.state_name() == "inactive"
+    assert stack.ended(scan).ending is Ending.ENDED
+    assert stack.scan_node.trigger_cleanup() is TransitionCallbackReturn.SUCCESS
 
 
 @pytest.mark.parametrize(
@@ -311,7 +323,7 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     future = stack.begin(heard, run_directory="named by the node")
     stack.own.remove_node(stack.scan_node)
     stack.scan_node.trigger_deactivate()
-    stack.scan_node.trigger_cleanup()
+    stack.scan_node.trigger_shutdown()
     outcome = stack.ended(future)
     assert outcome.ending is Ending.LOST
     # it can be resumed
