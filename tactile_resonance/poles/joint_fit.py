@@ -364,20 +364,37 @@ def noise_of_moving_modes(
     return float(noise_at_modes(plan, fitted.data, fitted.solution, scale)[0])
 
 
-def _several(first: _Round) -> Judged:
-    """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own."""
-    changed = np.flatnonzero(_weighted_wrongly(first) & first.solution.plain)
-    if not changed.size:
-        return _judged(first, first)
-    second = before = first.rows(changed)
+def _several(first: _Round, returns: int = MOST_RETURNS) -> Judged:
+    """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own.
+
+    Where start values hid how small the noise on Y is, that on U would look like distortion: it is taken anew
+    first, up to so many times.
+    """
+    plain, of_u = first.solution.plain, first.noise[:, 1] > 0
+    overrated = plain & of_u & (first.levels.between < 1 - SAME_LEVEL) & (returns > 0)
+
+    def anew(part: _Round) -> Judged:
+        return _several(_Round.weighted_with_noise(part.plan, part.plain, part.solution.theta), returns - 1)
+
+    parts = []
+    for which, judge in ((overrated, anew), (plain & ~overrated & _weighted_wrongly(first), _with_scatter)):
+        rows = np.flatnonzero(which)
+        if rows.size:
+            parts.append((rows, judge(first.rows(rows))))
+            if rows.size == plain.size:
+                return parts[0][1]
+    judged = _judged(first, first)
+    for rows, part in parts:
+        judged.put(rows, part)
+    return judged
+
+
+def _with_scatter(first: _Round) -> Judged:
+    """What a fit is worth whose lines are weighted with what realisations differ by."""
+    second = first
     for _ in range(REWEIGHTINGS):
         second = _from_scatter(second)
-    again = _judged(second, before)
-    if changed.size == len(first.kind):
-        return again
-    judged = _judged(first, first)
-    judged.put(changed, again)
-    return judged
+    return _judged(second, first)
 
 
 def _weighted_wrongly(fitted: _Round) -> BoolArray:

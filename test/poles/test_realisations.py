@@ -232,6 +232,24 @@ def test_input_noise_that_nobody_knows_is_weighted_by_what_realisations_differ_b
     assert_honest(errors, result.covariance[:, 0], bound_of_realisations(all_plants))
 
 
+class QuietOutput(Plant):
+    """All but all of the noise is that of U."""
+
+    @property
+    def noise(self):
+        return super().noise[0], 1e6 * super().noise[0]
+
+
+@pytest.mark.parametrize(("realisations", "periods"), [(3, 2), (2, 8)])
+def test_noise_of_the_input_far_above_that_of_the_output_is_no_distortion(realisations, periods):
+    """Start values hide how small the latter is: variances of the poles were 108 and 5 times the bound."""
+    all_plants = [QuietOutput(0.02, 100.0, periods, seed=10 + m) for m in range(realisations)]
+    u, y = spectra(all_plants, np.random.default_rng(22), RUNS)
+    result = plan_of(periods).from_bins(u, y)
+    errors = errors_of(result, 0.02)
+    assert_honest(errors, result.covariance[:, 0], bound_of_realisations(all_plants))
+
+
 @pytest.mark.parametrize(("realisations", "periods"), [(2, 1), (3, 4)])
 @pytest.mark.parametrize("distorted", [False, True])
 def test_a_neighbouring_mode_is_a_model_error(realisations, periods, distorted):
