@@ -44,6 +44,8 @@ NORMAL_EQUATIONS_LIMIT = 1e5
 LARGEST_BATCHED_ORDER = 6
 REBASE_ITERATIONS = 40
 ONLY_START = Rules(iterations=0)
+# Starts for a delay within a radian over the band.
+FINEST_DELAY = 50
 # Bases follow the denominator until it changes by less than this from one iteration to the next.
 REBASE_TOLERANCE = 1e-2
 
@@ -494,16 +496,20 @@ def _first_usable(data: BinData) -> BinData:
 
 
 def delay_starts(problem: Problem, row: BinData, phase: FloatArray) -> list[FloatArray | None]:
-    """Starts with the delay removed beforehand, on a grid of a radian over the band.
+    """Starts with the delay removed beforehand, from minus two to twelve radians over the band.
 
-    The cost has many minima in the delay, about half a turn of phase over the band apart.
+    The cost has many minima in the delay, half a turn of phase apart: over the band or, where B has too few
+    terms to turn the response, at the lines. The grid is of a quarter of a radian there; its three best minima
+    begin.
     """
-    step = 1.0 / max(float(np.ptp(phase)), 1e-12)
-    candidates = []
-    for delay in step * np.arange(-2, 13):
-        turned = row._replace(y=row.y * np.exp(1j * phase * delay))
-        begun = minimise(problem, turned, None, ONLY_START)
-        if np.isfinite(begun.theta).all():
-            candidates.append((float(begun.cost[0]), np.append(begun.theta[0, 0], delay)))
-    candidates.sort(key=lambda c: c[0])
-    return [theta for _, theta in candidates[:3]] or [None]
+    over_band = 1.0 / max(float(np.ptp(phase)), 1e-12)
+    step = max(0.25, over_band / FINEST_DELAY)
+    delays = step * np.arange(math.ceil(-2 * over_band / step), 12 * over_band / step)
+    all_of_row = row.rows(np.zeros(delays.size, np.int64))
+    turned = all_of_row._replace(y=row.y * np.exp(1j * delays[:, None, None] * phase))
+    begun = minimise(problem, turned, None, ONLY_START)
+    cost = np.where(np.isfinite(begun.theta).all(axis=(1, 2)), begun.cost, np.inf)
+    beside = np.minimum(np.append(np.inf, cost[:-1]), np.append(cost[1:], np.inf))
+    least = np.flatnonzero(np.isfinite(cost) & (cost <= beside))
+    best = least[np.argsort(cost[least], kind="stable")[:3]]
+    return [np.append(begun.theta[k, 0], delays[k]) for k in best] or [None]

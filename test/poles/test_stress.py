@@ -199,6 +199,17 @@ def test_pure_delay(delay_s):
     assert "delay" not in poles.message
 
 
+@pytest.mark.parametrize("delay_s", [-2e-3, 1e-3, 4.3e-3, 1e-2])
+@pytest.mark.parametrize(("numerator_order", "feedthrough"), [(0, 0.0), (2, 0.3), (2, 3.0)])
+def test_a_delay_of_more_than_half_a_turn_at_the_lines(numerator_order, feedthrough, delay_s):
+    """With few terms in B the cost has a minimum at each half turn of the lines, not of the band."""
+    lines_hz = np.linspace(200, 300, 101)
+    g = modal(lines_hz, [250], [0.02], [0.04], feedthrough) * np.exp(-2j * np.pi * lines_hz * delay_s)
+    poles = identify_frf(frf(lines_hz, g), None, ModelStructure(2, numerator_order, delay=True))
+    assert_exact(poles, 250, 0.02, 1e-8)
+    assert poles.fit.delay_s == pytest.approx(delay_s, abs=1e-12)
+
+
 def test_a_delay_is_not_told_from_residual_terms():
     """Its deviation held it in 24 to 74 %; the poles and residues of the response are known as well."""
     g = modal(LINES_HZ, [250], [0.02], [0.04]) * np.exp(-2j * np.pi * LINES_HZ * 1e-3)
