@@ -29,6 +29,8 @@ Plan = TypeVar("Plan", bound=FitPlan)
 
 # Beyond this the parameters have no figure left in double precision.
 LARGEST_CONDITION_NUMBER = 1e12
+# Of the variance of a delay, by what else is not known: beyond, its deviation says little of it.
+MOST_INFLATION = 100.0
 # Of `Judged.kind`.
 NAMES = np.array([*KINDS, "unknown", ""])
 # Fields that a `PolesBatch` takes as they are.
@@ -351,8 +353,10 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
     ]
     there[there] = real
     terms = batch.structure.numerator_order - batch.structure.order + 1
-    not_told = f"the delay is not told from {terms} residual terms: its own value and deviation mean little"
-    of_delay = [not_told] if batch.structure.delay and terms > 1 and there.any() else []
+    from_what = f"{terms} residual terms" if terms > 1 else "the numerator"
+    not_told = f"the delay is not told from {from_what}: its own value and deviation mean little"
+    untold = batch.structure.delay and there.any() and (terms > 1 or _inflation(coefficients) > MOST_INFLATION)
+    of_delay = [not_told] if untold else []
     notes = [*left_out, *of_delay, *notes]
 
     def optional(array: FloatArray) -> FloatArray | None:
@@ -383,6 +387,14 @@ def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] 
         status=status,
         message=message,
     )
+
+
+def _inflation(covariance: FloatArray) -> float:
+    """Variance of the last coefficient over what it would be if the others (n, n) were known; NaN: unknown."""
+    if not np.isfinite(covariance).all():
+        return float("nan")
+    std = np.sqrt(np.diagonal(covariance))
+    return float(np.linalg.pinv(covariance / np.outer(std, std), hermitian=True)[-1, -1])
 
 
 def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) -> str:

@@ -210,6 +210,23 @@ def test_a_delay_of_more_than_half_a_turn_at_the_lines(numerator_order, feedthro
     assert poles.fit.delay_s == pytest.approx(delay_s, abs=1e-12)
 
 
+@pytest.mark.parametrize("feedthrough", [0.0, 0.3])
+def test_the_deviation_of_a_delay_that_is_given_without_a_remark_holds_it(feedthrough):
+    """A numerator whose last term is nothing stands for small delays: deviations held it in half of them."""
+    lines_hz, rng, delay_s = np.linspace(200, 300, 101), np.random.default_rng(5), 4e-3
+    exact = modal(lines_hz, [250], [0.02], [0.04], feedthrough) * np.exp(-2j * np.pi * lines_hz * delay_s)
+    away = []
+    for _ in range(12):
+        g = exact + 1e-2 * rng.standard_normal((101, 2)).view(complex)[:, 0]
+        fields = {"variance_noise": np.full(101, 2e-4), "noise_dof": 1000}
+        poles = identify_frf(frf(lines_hz, g, **fields), None, ModelStructure(2, 2, delay=True))
+        if poles.status is PolesStatus.OK and "delay is not told" not in poles.message:
+            std_s = np.sqrt(poles.coefficient_covariance[-1, -1]) * poles.fit.delay_unit_s
+            away.append((poles.fit.delay_s - delay_s) / std_s)
+    assert bool(away) is (feedthrough > 0)
+    assert np.sum(np.square(away)) <= scipy.stats.chi2.ppf(1 - 1e-4, len(away) or 1)
+
+
 def test_a_delay_is_not_told_from_residual_terms():
     """Its deviation held it in 24 to 74 %; the poles and residues of the response are known as well."""
     g = modal(LINES_HZ, [250], [0.02], [0.04]) * np.exp(-2j * np.pi * LINES_HZ * 1e-3)
