@@ -143,6 +143,11 @@ def sentence(name: str, first: str, found: Sequence[Difference], apart: Sequence
     """What the differences of one run from the first say together; `apart` as `unlike` gives it."""
     if not found:
         return f"{name} and {first} have no place in common (0.1 mm) where both have poles with a covariance."
+    own = [each for each in found if each.change.any()]
+    if copies := len(found) - len(own):
+        same = "hold one measurement to the last digit, a copy or a simulation of one seed: it says nothing"
+        told = f"At {counted(copies, 'common place')} {name} and {first} {same}."
+        return f"{told} Elsewhere: {sentence(name, first, own, apart)}" if own else told
     off = np.array([each.deviations for each in found])
     rms, largest = np.sqrt(np.mean(off**2, axis=0)), np.max(np.abs(off), axis=0)
     beyond = int(np.count_nonzero(np.any(np.abs(off) > SIGNIFICANT, axis=1)))

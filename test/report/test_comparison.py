@@ -126,8 +126,21 @@ def test_poles_at_the_nominal_contact_are_compared_where_both_are_known():
     assert "Were nothing different, force and age of contact included, chance" in told
     assert "Were nothing different, chance" in sentence("b", "a", [each])
     mixed = replace(drawn(2, 1), results=(*first.results, drawn(2, 1).results[1]))
-    told = sentence("b", "a", differences(mixed, mixed))
+    moved = (replace(r, f0_hz=r.f0_hz + 0.01, nominal_f0_hz=250.0) for r in mixed.results)
+    again = replace(mixed, results=tuple(moved))
+    told = sentence("b", "a", differences(mixed, again))
     assert "2 places in common, poles at the nominal contact at 1 of them, else as measured" in told
+
+
+def test_what_a_copy_of_a_run_shares_with_it_says_nothing_of_the_points_that_were_measured_again():
+    """Ten points that moved by 1.4 deviations, of 200 runs: with ten copies beside them p < 5 % for three."""
+    first, other = drawn(20, 1), drawn(20, 2, shift=(1.4 * STD[0], 0.0))
+    resumed = run_of([*first.latest[:10], *other.latest[10:]])
+    moved = differences(first, run_of(other.latest[10:]))
+    told = sentence("b", "a", differences(first, resumed))
+    assert told.startswith("At 10 common places b and a hold one measurement to the last digit")
+    assert told.endswith(sentence("b", "a", moved))
+    assert sentence("b", "a", differences(first, first)).endswith("it says nothing.")
 
 
 def test_what_sets_two_scenes_apart_is_named_and_no_pole_taken_as_one_of_the_others_contact(tmp_path):
