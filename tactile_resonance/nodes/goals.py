@@ -37,6 +37,16 @@ from tactile_resonance.scan.hands import (
 )
 
 
+def _locked(name: str) -> Callable:
+    """Method of `ActionClient`, while no other of its client's is under way in another thread."""
+
+    def call(client: GoalClient, *args: Any, **kwargs: Any) -> Any:
+        with client.registering:
+            return getattr(ActionClient, name)(client, *args, **kwargs)
+
+    return call
+
+
 class GoalClient(ActionClient):
     """`ActionClient` whose executor takes no answer before its request is registered.
 
@@ -45,28 +55,13 @@ class GoalClient(ActionClient):
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self._registering = threading.Lock()
+        self.registering = threading.Lock()
         super().__init__(*args, **kwargs)
 
-    def take_data(self) -> Any:
-        """As the executor asks for it."""
-        with self._registering:
-            return super().take_data()
-
-    def send_goal_async(self, *args: Any, **kwargs: Any) -> Future:
-        """As every client."""
-        with self._registering:
-            return super().send_goal_async(*args, **kwargs)
-
-    # What the methods of a goal handle call.
-
-    def _get_result_async(self, goal_handle: ClientGoalHandle) -> Future:
-        with self._registering:
-            return super()._get_result_async(goal_handle)
-
-    def _cancel_goal_async(self, goal_handle: ClientGoalHandle) -> Future:
-        with self._registering:
-            return super()._cancel_goal_async(goal_handle)
+    # what the executor takes answers with; what sends, the last two for the methods of a goal handle
+    take_data, send_goal_async = _locked("take_data"), _locked("send_goal_async")
+    _get_result_async = _locked("_get_result_async")
+    _cancel_goal_async = _locked("_cancel_goal_async")
 
 
 POLL_S = 0.005
