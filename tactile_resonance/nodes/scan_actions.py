@@ -195,17 +195,11 @@ def calibration_request(message: CalibrateTable.Goal) -> CalibrationRequest:
 
 def no_table(outcome: int, message: str = "") -> CalibrateTable.Result:
     """Result without a table: no figure of it is known."""
-    nan = math.nan
-    return CalibrateTable.Result(
-        outcome=outcome,
-        message=message,
-        table_in_base=[nan] * 6,
-        height_m=nan,
-        tilt_x_rad=nan,
-        tilt_y_rad=nan,
-        covariance=[nan] * 9,
-        reduced_chi_square=nan,
-    )
+    result = CalibrateTable.Result(outcome=outcome, message=message)
+    result.table_in_base, result.covariance = [math.nan] * 6, [math.nan] * 9
+    for name in ("height_m", "tilt_x_rad", "tilt_y_rad", "reduced_chi_square"):
+        setattr(result, name, math.nan)
+    return result
 
 
 def fill_calibration_result(result: CalibrateTable.Result, made: TableCalibration) -> None:

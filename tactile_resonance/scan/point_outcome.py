@@ -53,20 +53,9 @@ def air_point(index: int) -> ScanPoint:
 
 def attempt_at(point: ScanPoint, attempt: int, frame_id: str) -> PointResult:
     """Result of an attempt at a point, in a frame, of which nothing more is known yet."""
-    x_m, y_m, z_m = point.position_m
-    normal_x, normal_y, normal_z = point.normal
-    return PointResult(
-        index=point.index,
-        attempt=attempt,
-        label=point.label,
-        x_m=x_m,
-        y_m=y_m,
-        z_m=z_m,
-        normal_x=normal_x,
-        normal_y=normal_y,
-        normal_z=normal_z,
-        frame_id=frame_id,
-    )
+    names = ("x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z")
+    where: dict[str, Any] = dict(zip(names, (*point.position_m, *point.normal), strict=True))
+    return PointResult(point.index, attempt, point.label, frame_id=frame_id, **where)
 
 
 def measured_result(
