@@ -247,12 +247,15 @@ def _linearised(
     directions = np.concatenate([modes.directions(row) for row in rows])
     others = plan.others_at.size
     data = BinData.of(y[None, None], u[None, None], plan.order, others)
-    if not flat:
-        data, *_ = with_noise(plan, data, theta[None, None])
+    known, *_ = with_noise(plan, data, theta[None, None])
+    alike = known.covariance_yu.size > 0  # noise on both channels
+    if not (flat and alike):
+        data = known  # what came through the input is no drift
     at = Linearised.of(plan.problem, data, theta)
     if flat:
-        error = at.error[:, :others]
-        variance_y, variance_u = rough_noise(error, data.u[0][:, data.order[:others]])
+        variance_y, variance_u = rough_noise(at.error[:, :others], data.u[0][:, data.order[:others]])
+        if not alike:
+            variance_u = known.variance_u.mean(axis=-1, keepdims=True)
         data = data.weighted(rest=variance_y, variance_y=variance_y, variance_u=variance_u)
     costs, gradients, normals = moments(plan.problem.tables, data, theta[None, None])
     cost, gradient = float(costs.sum()), gradients[0, 0]
