@@ -328,14 +328,8 @@ def disagreement(
 def _odd_one(gain: ComplexArray, pairs: BoolArray, apart: IntArray) -> str:
     """Which realisation differs, for people.
 
-    Parameters
-    ----------
-    gain : (M, M) complex
-        ``gain[m, n]``: response of m in units of that of n; 1 where they agree.
-    pairs : (M, M) bool
-        Coherent, but of another phase or gain.
-    apart : (k,) int
-        Those of `_apart`.
+    ``gain[m, n]`` (M, M) is the response of m in units of that of n, `pairs` (M, M) are coherent but of another
+    phase or gain, `apart` (k,) those of `_apart`.
     """
     if apart.size:
         names = " and ".join(str(m + 1) for m in apart)

@@ -61,7 +61,7 @@ def rehearse() -> None:
     from tactile_resonance.frf.result import FRF
     from tactile_resonance.poles.identify import identify_batch
     from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-    from tactile_resonance.poles.noise_level import log_linear, two_channels
+    from tactile_resonance.poles.noise_level import two_channels
     from tactile_resonance.poles.structure import ModelStructure
 
     frequency_hz, rng = np.arange(65) / 128, np.random.default_rng(0)
@@ -74,8 +74,7 @@ def rehearse() -> None:
     JointPlan(*kind)(u[0], y[0])
     PoleEstimator(*kind)(u, y)
     identify_batch(FRF(frequency_hz, g, np.ones(65), noise_dof=2), None, ModelStructure(2, 2))
-    two_channels(np.ones((1, 3)), np.ones((1, 3)))  # where noise is neither flat nor sloped
-    log_linear(np.ones((1, 3)))
+    two_channels(np.ones((1, 3)), np.ones((1, 3)), np.zeros(1, bool))  # of several realisations alone
 
 
 _begun: list[bool] = []

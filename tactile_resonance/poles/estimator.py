@@ -252,6 +252,7 @@ def _plan(
     )
 
 
+@np.errstate(all="ignore")  # what exceeds double precision is left to the status of the fit
 def _poles_with_all_bins(
     plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch
 ) -> Poles | None:
@@ -273,7 +274,10 @@ def _poles_with_all_bins(
         None where the excited lines are all there is; see `DISTURBED` and `EXPLAINED`.
     """
     wrong = batch.status() is PolesStatus.MODEL_ERROR and not np.isfinite(batch.lacking[0])
-    if batch.status() is PolesStatus.TOO_FEW_LINES or not _disturbed(plan, u):
+    if batch.status() is PolesStatus.TOO_FEW_LINES or plan.others_at.size == 0:
+        return None
+    between, lines = (np.mean(np.abs(u[..., at]) ** 2) for at in (plan.others_at, plan.excited_at))
+    if not DISTURBED * lines <= between < np.inf:
         return None
     plan_of_all = replace(plan, harmonics=None, input_noise_ratio=0.0)
     of_all = plan_of_all.from_bins(u, y)
@@ -282,7 +286,8 @@ def _poles_with_all_bins(
         of_all = plan_of_all.from_bins(u, y)
     if wrong and not of_all.noise_variance[0] * EXPLAINED < batch.noise_variance[0]:
         return None
-    explained = _explained(plan, of_all, u)
+    g, (noise_y, noise_u) = of_all.fit.response(plan.frequency_hz[plan.others_at]), of_all.noise_variance
+    explained = np.mean(np.abs(g * u[..., plan.others_at]) ** 2) / (noise_y + noise_u * np.mean(np.abs(g) ** 2))
     better = of_all.status() is PolesStatus.OK or (
         of_all.status() is PolesStatus.MODEL_ERROR and batch.status() is not PolesStatus.OK
     )
@@ -299,16 +304,6 @@ def _poles_with_all_bins(
     return replace(poles, method=f"{poles.method}, all bins as excitation")
 
 
-@np.errstate(all="ignore")  # what exceeds double precision is left to the status of the fit
-def _disturbed(plan: JointPlan, u: ComplexArray) -> bool:
-    if plan.others_at.size == 0:
-        return False
-    power = np.abs(u) ** 2
-    lines = np.mean(power[..., plan.excited_at])
-    return bool(DISTURBED * lines <= np.mean(power[..., plan.others_at]) < np.inf)
-
-
-@np.errstate(all="ignore")
 def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch) -> float:
     """Variance of the noise on U over that on Y, from residuals whose power is ``a + b |G|^2``.
 
@@ -316,21 +311,12 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch) -> float:
     """
     gain = np.abs(of_all.fit.response(plan.frequency_hz)) ** 2
     variance = np.abs(of_all.residual) ** 2 * (1 + (plan.input_noise_ratio or 0.0) * gain)
-    curve = two_channels(variance[None], gain[None])[0]
+    curve = two_channels(variance[None], gain[None], np.zeros(1, bool))[0]
     low, high = np.argmin(gain), np.argmax(gain)
     slope = (curve[high] - curve[low]) / max(gain[high] - gain[low], np.finfo(float).tiny)
     floor = LEAST_VARIANCE * curve.mean()
     found = slope / max(curve[low] - slope * gain[low], floor, np.finfo(float).tiny)
     return float(found) if np.isfinite(found) else 0.0  # of a fit that failed
-
-
-@np.errstate(all="ignore")  # a fit that failed explains nothing
-def _explained(plan: JointPlan, of_all: PolesBatch, u: ComplexArray) -> float:
-    """Mean square of ``G U`` between harmonics over the variance of ``Y - G U``."""
-    g = of_all.fit.response(plan.frequency_hz[plan.others_at])
-    made = np.mean(np.abs(g * u[..., plan.others_at]) ** 2)
-    noise_y, noise_u = of_all.noise_variance
-    return float(made / (noise_y + noise_u * np.mean(np.abs(g) ** 2)))
 
 
 CANDIDATES = tuple(ModelStructure.with_residual(n, r) for n in (2, 4, 6) for r in (6, 8, 10))

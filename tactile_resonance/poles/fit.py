@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 from scipy import optimize
 
 from tactile_resonance._typing import ComplexArray, FloatArray
@@ -36,16 +35,7 @@ def minimise(
     start: FloatArray | None = None,
     rules: Rules = ORDINARY,
 ) -> Solution:
-    """Minimise the cost of each point.
-
-    Parameters
-    ----------
-    problem : Problem
-    data : BinData
-    start : (points, M, n) float, optional
-        Start values are Sanathanan-Koerner iterations' when absent.
-    rules : Rules
-    """
+    """Minimise the cost of each point, from a start (points, M, n) or from Sanathanan-Koerner iterations."""
     begin = np.empty((0, data.records, sum(problem.sizes))) if start is None else start
     return likelihood.minimise(problem.tables, data, begin, rules)
 
@@ -55,7 +45,7 @@ def refit_failed(problem: Problem, solution: Solution, data: BinData) -> None:
     for k in np.flatnonzero(~solution.converged & solution.plain):
         found = least_squares(problem, data.rows(slice(k, k + 1)))
         if found.converged:
-            solution.put(np.array([k]), found.solution(problem, *found.inverse()))
+            solution.put(np.array([k]), found.solution(problem))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +76,9 @@ class DenseSolution:
         """Sum of the squared residuals."""
         return float(np.sum(self.residual.real**2 + self.residual.imag**2))
 
-    def solution(self, problem: Problem, inverse: FloatArray, condition: float) -> Solution:
-        """The same of a batch of one, with its `inverse` or `covariance`; a delay stays last in theta."""
+    def solution(self, problem: Problem) -> Solution:
+        """The same of a batch of one; a delay stays last in theta."""
+        inverse, condition = self.covariance()
         records, undriven = len(self.jacobian), problem.undriven
         a, b, own = problem.sizes
         shared, n = a + b, self.theta.size - (records - 1) * own
@@ -117,14 +108,8 @@ class DenseSolution:
             np.ones(1, bool),
         )
 
-    def inverse(self) -> tuple[FloatArray, float]:
-        """Inverse of the normal matrix and its condition number, as `likelihood.invert` has them."""
-        jacobian = self.jacobian.reshape(-1, self.theta.size)
-        inverse, condition = likelihood.invert((jacobian.T @ jacobian)[None])
-        return inverse[0], float(condition[0])
-
     def covariance(self) -> tuple[FloatArray, float]:
-        """``(J^T J)^-1`` through singular values, and the condition number with unit columns."""
+        """``(J^T J)^-1`` through singular values, and the condition number as in `likelihood.invert`."""
         jacobian = self.jacobian.reshape(-1, self.theta.size)
         column = np.linalg.norm(jacobian, axis=0)
         n = column.size
@@ -134,7 +119,8 @@ class DenseSolution:
         if singular[-1] <= 0 or singular.size < n:
             return np.full((n, n), np.nan), float("inf")
         half = vh.T / singular
-        return half @ half.T / np.outer(column, column), float(singular[0] / singular[-1])
+        condition = (np.sum(singular**4) * np.sum(singular**-4.0)) ** 0.25
+        return half @ half.T / np.outer(column, column), float(condition)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,8 +220,6 @@ def least_squares(
     first_size : (K,) float, optional
         ``|A|`` that start values begin from; 1 when absent.
     """
-    used = np.tile(np.isfinite(data.variance[0]), data.records)
-    all_used = bool(used.all())
     newest: list[tuple[bytes, Linearised]] = []
 
     def at(theta: FloatArray) -> Linearised:
@@ -245,25 +229,19 @@ def least_squares(
             newest[:] = [(key, Linearised.of(problem, data, theta, delay_phase))]
         return newest[0][1]
 
-    def flat(values: npt.NDArray) -> npt.NDArray:
-        """Real and imaginary parts of bins that are not left out."""
-        columns = values.size // (2 * used.size)
-        rows = values.reshape(used.size, 2, columns)
-        return (rows if all_used else rows[used]).reshape(-1, max(columns, 1))
-
     with np.errstate(all="ignore"):
         if start is None:
             start = _best_start(problem, data, first_size)
             if delay_phase is not None:
                 start = np.append(start, 0.0)
         converged, theta = False, start
-        begin = flat(at(start).residual.view(float))
+        begin = at(start).residual.view(float)
         if np.isfinite(begin).all() and begin.size >= start.size:
             try:
                 found = optimize.least_squares(
-                    lambda theta: _finite(flat(at(theta).residual.view(float))[:, 0], 1e150),
+                    lambda theta: _finite(at(theta).residual.view(float).ravel(), 1e150),
                     start,
-                    lambda theta: _finite(flat(at(theta).jacobian), 0.0),
+                    lambda theta: _finite(at(theta).jacobian.reshape(-1, theta.size), 0.0),
                     method="lm",
                     x_scale="jac",
                     ftol=LEAST_SQUARES_TOLERANCE,

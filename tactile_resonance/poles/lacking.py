@@ -77,16 +77,7 @@ class Directions:
     def on_lines(
         cls, frequency_hz: FloatArray, x: ComplexArray, numerator_order: int
     ) -> Directions:
-        """Directions on lines.
-
-        Parameters
-        ----------
-        frequency_hz : (K,) float
-            Ascending.
-        x : (K,) complex
-            The variable of the model there.
-        numerator_order : int
-        """
+        """Directions on ascending lines (K,), where the variable of the model is x (K,)."""
         tried = poles_tried(frequency_hz)  # the widest last
         pole = tried[-max(MOST_TRIED // frequency_hz.size, 1) :]
         s = 2j * np.pi * frequency_hz[:, None]
@@ -119,13 +110,7 @@ def asks(
 ) -> BoolArray:
     """(batch,) for which points of a batch `Lack.of` is worth its time.
 
-    Parameters
-    ----------
-    plan : JointPlan
-    cost, expected : (batch,) float
-        Of the excited bins.
-    residual : (batch, K) complex
-        Weighted, turned by the phase of the input.
+    From cost and expectation (batch,) of the excited bins, and residuals (batch, K) as in `Solution`.
     """
     others = plan.others_at.size
     if others == 0:
@@ -165,18 +150,9 @@ class Lack:
     ) -> Lack:
         """Of the points that are asked (batch,); nothing of the others.
 
-        Parameters
-        ----------
-        plan, data, solution
-            The fit.
-        asked : (batch,) bool
-        least : (batch,) float, optional
-            Of the level of the noise over that weighted with, where it is known beforehand; 0 when absent.
-
-        Notes
-        -----
-        The level of the noise is what the residuals of all bins have besides that direction, so that each
-        direction has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
+        The level of the noise over that weighted with is `least` (batch,) at least, where it is known
+        beforehand; 0 when absent. It is what the residuals of all bins have besides a direction, so that each
+        has an F test of 2 and ``2 (dof - 1)`` degrees of freedom: a share R of the cost is
         exceeded by chance with ``(1 - R)^(dof - 1)``.
         """
         batch, rows = asked.size, asked.nonzero()[0]

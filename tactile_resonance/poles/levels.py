@@ -56,14 +56,8 @@ def level_of(
     Without bins between harmonics it is from the residuals, and a model error hides in it unless they
     are smooth. With such bins these give the level, and the excited ones whether the model holds.
 
-    Parameters
-    ----------
-    plan : JointPlan
-    solution : Solution
-    noise : (batch, 2) float
-        Mean variances of Y and U weighted with.
-    by_piece : (batch,) bool
-        Where the variances are from each of the pieces of the band alone.
+    Weighted with are mean variances of Y and U of `noise` (batch, 2), where `by_piece` (batch,) from each of
+    the pieces of the band alone.
 
     Returns
     -------
@@ -105,18 +99,8 @@ def noise_at_modes(
     """(batch,) factor of the covariance of points; see `noise_level.at_modes`.
 
     Each undriven bin shows the noise there, and those beside a driven one the noise on it. The records of a
-    point pool their noise.
-
-    Parameters
-    ----------
-    plan : JointPlan
-    data : BinData
-        With undriven bins.
-    solution : Solution
-    scale : (batch,) float
-        Level of the noise in units of the variances of the data.
-    part : (batch, K_e) float, optional
-        Of the variance of the residuals on driven bins that is noise; all of it when absent.
+    point pool their noise. Its level is `scale` (batch,) in units of the variances of the data; of that of the
+    residuals on driven bins `part` (batch, K_e) is noise.
     """
     problem, first = plan.problem, data.undriven
     (a, b, _), theta, inverse = problem.sizes, solution.theta, solution.marginal
@@ -207,19 +191,9 @@ class Levels:
         pieces: Pieces,
         by_piece: BoolArray,
     ) -> Levels:
-        """Levels of a fit.
+        """Levels of a fit to excited lines of inputs u (batch, M, K_e), weighted with `variance` (batch, K_e).
 
-        Parameters
-        ----------
-        plan : JointPlan
-        solution : Solution
-        u : (batch, M, K_e) complex
-            Input on excited lines.
-        variance : (batch, K_e) float
-            That these were weighted with.
-        pieces : Pieces
-        by_piece : (batch,) bool
-            Where that variance is from each of the pieces alone.
+        Where `by_piece` (batch,) that is from each of the pieces alone.
         """
         batch, records, lines = solution.residual.shape
         size = np.abs(u)
@@ -339,19 +313,10 @@ class Spread:
         inner: FloatArray,
         dof: FloatArray,
     ) -> Spread:
-        """Departures from a fit.
+        """Departures from a fit theta (batch, M, n) to data with the variances that it was weighted with.
 
-        Parameters
-        ----------
-        plan : JointPlan
-        data : BinData
-            With the variances that it was weighted with.
-        theta : (batch, M, n) float
-            The fit.
-        inner : (batch, M, n, n) float
-            Covariance of the gradient of each realisation, twice, if lines scattered independently.
-        dof : (batch,) float
-            Complex degrees of freedom of that.
+        `inner` (batch, M, n, n) is twice the covariance of the gradient of each realisation, if lines scattered
+        independently, with complex `dof` (batch,).
         """
         a, b, _ = plan.problem.sizes
         batch, records, n = theta.shape

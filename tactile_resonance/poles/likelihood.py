@@ -567,14 +567,7 @@ def _unpacked(gram, g, normal, point):
 
 @entry
 def moments(tables, data, theta):
-    """Cost, gradient and normal matrices of a batch.
-
-    Parameters
-    ----------
-    tables : Tables
-    data : BinData
-    theta : (points, M, n) float
-        Coefficients [A without its last, B, C] of each record, A and B alike in all.
+    """Cost, gradient and normal matrices of a batch, at theta (points, M, n) as in `Solution`.
 
     Returns
     -------
@@ -904,19 +897,9 @@ def _marginals(gram, g, c, whole, inverse, scale, row, marginal, leverage, point
 
 @entry
 def minimise(tables, data, start, rules):
-    """Minimise the cost of each point.
+    """The `Solution` of least cost of each point.
 
-    Parameters
-    ----------
-    tables : Tables
-    data : BinData
-    start : (points, M, n) float
-        Empty: start values are those of two Sanathanan-Koerner iterations.
-    rules : Rules
-
-    Returns
-    -------
-    Solution
+    From a start (points, M, n); where that is empty from two Sanathanan-Koerner iterations.
     """
     points, records = data.y.shape[:2]
     c, n = tables.c, tables.a + tables.b + tables.c

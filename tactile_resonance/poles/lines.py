@@ -373,7 +373,7 @@ class LinesPlan(FitPlan):
         for k in doubtful:
             dense = least_squares(self.problem, data.rows(slice(k, k + 1)))
             if dense.cost <= solution.cost[k] * (1 + 1e-9) or not converged[k]:
-                solution.put(np.array([k]), dense.solution(self.problem, *dense.covariance()))
+                solution.put(np.array([k]), dense.solution(self.problem))
         return self, solution
 
     def compared(self, data: BinData, start: FloatArray | None = None) -> ComplexArray:
@@ -461,11 +461,8 @@ class LinesPlan(FitPlan):
 
     def _fit_dense(self, data: BinData) -> tuple[LinesPlan, Solution]:
         """Point by point."""
-        each = []
-        for k in range(len(data.y)):
-            found = self._best_of_starts(data.rows(slice(k, k + 1)))
-            each.append(found.solution(self.problem, *found.covariance()))
-        return self, Solution.joined(each)
+        rows = (data.rows(slice(k, k + 1)) for k in range(len(data.y)))
+        return self, Solution.joined([self._best_of_starts(row).solution(self.problem) for row in rows])
 
     def _best_of_starts(self, row: BinData) -> DenseSolution:
         """Of several starts the one with the least cost."""

@@ -197,13 +197,7 @@ def model_error_factor(
 
     The excess of the cost shows how large the errors are; their correlation from line to line, how
     many of them act together: errors that keep their sign over L lines disturb a coefficient as L
-    times fewer lines of independent errors would.
-
-    Parameters
-    ----------
-    residual : (batch, F) complex
-        Weighted.
-    cost, expected_cost : (batch,) float
+    times fewer lines of independent errors would. Residuals (batch, F) are weighted.
     """
     ratio = np.fmax(cost / expected_cost, 1.0)  # 1 where the level itself is from the residuals
     return ratio * correlation_length(residual)
@@ -228,17 +222,8 @@ def correlation_length(residual: ComplexArray) -> FloatArray:
 def difference_of_halves(even_rad_s: ComplexArray, odd_rad_s: ComplexArray) -> FloatArray:
     """Outer product of what even and odd lines differ by in (f0_hz, damping_ratio).
 
-    What one wild line does shows in no residual of its neighbours; it does between halves of the
-    lines.
-
-    Parameters
-    ----------
-    even_rad_s, odd_rad_s : (..., places) complex
-        Poles found from either half; NaN where a half does not have the mode.
-
-    Returns
-    -------
-    (..., places, 2, 2) float
+    What one wild line does shows in no residual of its neighbours; it does between halves of the lines.
+    (..., places, 2, 2) of poles (..., places) found from either; NaN where one does not have the mode.
     """
     even, odd = (
         np.stack(natural_frequency_and_damping(p), axis=-1) for p in (even_rad_s, odd_rad_s)

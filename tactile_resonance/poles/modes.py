@@ -60,13 +60,7 @@ def _in_band(poles, low_hz, high_hz):
 def propagated(poles, sensitivity, parameters):
     """Covariances (points, k, 2, 2) of (Re, Im) of poles (points, k), and of (f0_hz, damping_ratio).
 
-    Parameters
-    ----------
-    poles : (points, k) complex
-    sensitivity : (points, k, p) complex
-        Derivatives of the poles by coefficients.
-    parameters : (points, n, n) float
-        Covariance of coefficients, of which the first p belong to the sensitivity.
+    From derivatives of the poles (points, k, p) by the first p coefficients, of covariance (points, n, n).
     """
     points, count, p = sensitivity.shape
     of_poles, in_f0 = np.empty((points, count, 2, 2)), np.empty((points, count, 2, 2))
@@ -102,19 +96,8 @@ def pole_quantities(
 ) -> tuple[dict[str, npt.NDArray], ComplexArray]:
     """Poles in the band and what follows from them, by the names that `PolesBatch` gives them.
 
-    Parameters
-    ----------
-    model : RationalModel
-        Of points.
-    band_hz : (low, high)
-    parameters : (points, n, n) float
-        Covariance of the free coefficients, those of the denominator first.
-
-    Returns
-    -------
-    dict
-    sensitivity : (points, k, n) complex
-        Derivatives of the poles by the coefficients of the denominator.
+    With a covariance (points, n, n) of the free coefficients, those of the denominator first. And the
+    derivatives (points, k, n) of the poles by these.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         poles = modes_in_band(model.poles_rad_s(), band_hz)
@@ -243,14 +226,8 @@ def second_order(poles: ComplexArray, found: BoolArray, distance: FloatArray) ->
 
     Two modes nearer than their widths are known by their sum; how it is shared is as uncertain as the residue
     that is known less. That moves both poles, by up to their distance: to first order within their
-    covariance, to second order by the square of the residue's relative deviation.
-
-    Parameters
-    ----------
-    poles : (batch, k) complex
-    found : (batch, k) bool
-    distance : (batch, k) float
-        Of `significant_modes`.
+    covariance, to second order by the square of the residue's relative deviation. `found` and `distance`
+    (batch, k) are those of `significant_modes`.
     """
     pairs = _near(poles) & found[:, :, None] & found[:, None, :] & ~np.eye(found.shape[-1], dtype=bool)
     least = np.minimum(distance[:, :, None], distance[:, None, :])

@@ -141,15 +141,10 @@ def at_modes(ratio: FloatArray, dof: FloatArray) -> FloatArray:
     """(batch,) factor of covariances for noise above a curve over the band where the modes are.
 
     The test for such a curve is one of all lines: it does not see the noise of the few that a pole is known
-    from. The rarer chance makes what they show, the more it counts.
-
-    Parameters
-    ----------
-    ratio : (batch, places, 2) float
-        Of sample variances to those of the curve, the mean over lines weighted with their shares in the
-        variance of a pole; NaN where there is none.
-    dof : (batch, places, 2) float
-        Complex degrees of freedom of it: those of a line over the sum of the squares of these shares.
+    from. The rarer chance makes what they show, the more it counts. The ratio (batch, places, 2) of sample
+    variances to those of the curve is the mean over lines weighted with their shares in the variance of a pole,
+    NaN where there is none; its complex degrees of freedom are those of a line over the sum of the squares of
+    these shares.
     """
     more = ratio * student_variance(np.maximum(dof, 2)) - 1
     above = (more > 0) & np.isfinite(more)
@@ -167,14 +162,7 @@ def chance_of_pieces(
     Lines of a piece share the error of its variance: sums over pieces of F(2 size, 2 dof), as a chi-square of
     the same mean and variance.
 
-    Parameters
-    ----------
-    ratio : (batch,) float
-    lines : (batch,) float or int
-    size : float
-        Lines of a piece.
-    dof : (batch,) float or int
-        Complex degrees of freedom of the variance of a piece.
+    Of so many `lines`, `size` in each piece, whose variance has so many complex degrees of freedom.
     """
     spread = (size + dof - 1) / (lines * (dof - 2))
     return np.asarray(special.chdtrc(2 / spread, 2 / spread * ratio))
@@ -183,15 +171,9 @@ def chance_of_pieces(
 def is_rare(
     ratio: FloatArray, dof: FloatArray, other_dof: FloatArray, probability: float
 ) -> BoolArray:
-    """(batch,) whether chance makes a ratio of two variances more rarely than this.
+    """(batch,) whether chance makes a ratio of two variances more rarely than a probability below a hundredth.
 
-    Parameters
-    ----------
-    ratio : (batch,) float
-    dof, other_dof : (batch,) float
-        Complex degrees of freedom of the first and of the second.
-    probability : float
-        Below a hundredth.
+    `dof` and `other_dof` (batch,) are the complex degrees of freedom of the first and of the second.
     """
     # within two deviations of 1 chance is not below that
     rare = np.asarray(ratio > 1 + 2 * np.sqrt(1 / dof + 1 / other_dof))
@@ -319,7 +301,7 @@ def _add_channels(sample, gain, usable, model):
 
 @inner
 def _fit_slope(sample, usable, model):
-    """A fit of `log_linear`."""
+    """A maximum likelihood fit of ``exp(c_0 + c_1 x)`` by Fisher scoring."""
     lines = sample.size
     used = i01 = i11 = total = 0.0
     for k in range(lines):
@@ -349,27 +331,20 @@ def _fit_slope(sample, usable, model):
 
 
 @entry
-def two_channels(variance, gain):
+def two_channels(variance, gain, sloped):
     """(batch, F) fit of ``a + b gain``, neither negative, to gamma distributed variances.
 
-    Iteratively reweighted least squares is maximum likelihood here: the variance of a gamma
-    variable is proportional to its squared mean.
+    Where `sloped` (batch,) times ``exp(c_0 + c_1 x)``, fitted first. Iteratively reweighted least squares, or
+    Fisher scoring, is maximum likelihood here: the variance of a gamma variable is proportional to its squared
+    mean.
     """
-    model, usable = np.empty_like(variance), np.ones(variance.shape[1])
+    model, usable, curve = np.empty_like(variance), np.ones(variance.shape[1]), np.ones(variance.shape[1])
     for point in range(variance.shape[0]):
-        _add_channels(variance[point], gain[point], usable, model[point])
-    return model
-
-
-@entry
-def log_linear(variance):
-    """(batch, F) maximum likelihood fit of ``exp(c_0 + c_1 x)`` to gamma distributed variances.
-
-    By Fisher scoring.
-    """
-    model, usable = np.empty_like(variance), np.ones(variance.shape[1])
-    for point in range(variance.shape[0]):
-        _fit_slope(variance[point], usable, model[point])
+        curve[:] = 1.0
+        if sloped[point]:
+            _fit_slope(variance[point], usable, curve)
+        _add_channels(variance[point] / curve, gain[point], usable, model[point])
+        model[point] *= curve
     return model
 
 
@@ -384,22 +359,11 @@ def smooth_variance(
 ) -> tuple[FloatArray, IntArray]:
     """Variance on each line from sample variances, and its kind as index into `KINDS`.
 
-    Flat on both channels unless a test says otherwise, then sloped, then piece by piece.
-
-    Parameters
-    ----------
-    sample : (batch, K) float
-    gain : (batch, K) float
-        ``|G|^2``.
-    pieces : Pieces
+    From samples (batch, K) and a `gain` ``|G|^2``: flat on both channels unless a test says otherwise, then
+    sloped, then piece by piece.
     """
     kind = model_variance(pieces.means(sample), pieces.dof, pieces.means(gain)).kind
-    variance = two_channels(sample, gain)
-    sloped, each = kind == 1, kind == 2
-    if sloped.any():  # with noise of both channels, whose sum follows the resonance
-        curve = log_linear(sample[sloped])
-        more = two_channels(sample[sloped] / curve, gain[sloped])
-        variance[sloped] = curve * more
+    variance, each = two_channels(sample, gain, kind == 1), kind == 2
     if each.any():
         variance[each] = pieces.means(sample[each])[:, pieces.of_bin]
     return variance, kind

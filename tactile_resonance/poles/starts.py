@@ -51,14 +51,9 @@ TRIED_AT_ONCE = 128
 
 
 def best_of_split(plan: FitPlan, data: BinData, solution: Solution) -> Solution:
-    """The solution, or that from a start with its highest peak split if that costs less by more than noise.
+    """The solution, of order 4 or more, or that from a start with its highest peak split.
 
-    Parameters
-    ----------
-    plan : FitPlan
-    data : BinData
-    solution : Solution
-        Of a denominator of order 4 or more.
+    If that costs less by more than noise.
     """
     start, there = _split_starts(plan, data, solution.theta)
     rows = np.flatnonzero(there)
@@ -127,22 +122,7 @@ def _coefficients(plan: FitPlan, data: BinData, poles: ComplexArray) -> FloatArr
 def exchanged(
     plan: LinesPlan, row: BinData, found: DenseSolution
 ) -> tuple[LinesPlan, DenseSolution]:
-    """The deepest minimum that is found by moving modes.
-
-    Parameters
-    ----------
-    plan : LinesPlan
-    row : BinData
-        Of one point.
-    found : DenseSolution
-        Where to begin.
-
-    Returns
-    -------
-    plan : LinesPlan
-        With bases that suit the solution.
-    found : DenseSolution
-    """
+    """The deepest minimum that is found by moving modes of a solution of one point; bases that suit it."""
     tried = poles_tried(plan.frequency_hz)
     for _ in range(2 * plan.structure.order):
         missing, chance = _most_lacking(plan, row, found, tried)
@@ -228,15 +208,8 @@ def _falls(
 ) -> FloatArray:
     """(N,) by how much a mode at each of N poles lets the cost fall, in the first step.
 
-    Parameters
-    ----------
-    s : (K, 1) complex
-    weight : (K, 1) complex
-        By which a response becomes a residual.
-    basis : (2 K, parameters) float
-        Orthonormal, of the directions that the model has already.
-    residual : (2 K,) float
-    tried : (N,) complex
+    At s (K, 1), where `weight` (K, 1) makes a response a residual (2 K,), with an orthonormal `basis`
+    (2 K, parameters) of the directions that the model has already.
     """
     above, below = 1 / (s - tried), 1 / (s - tried.conj())
     scaled = np.abs(tried.real) * weight

@@ -129,38 +129,32 @@ class Part(NamedTuple):
                         by_weight.setdefault(weight + k, []).append((part, i * (n + 1) + j))
         for k, values in enumerate((last.real, last.imag)):
             by_row[ROW_A + k].append((values, n))
-        zeros, blocks = np.zeros(last.size), last.size // BLOCK
-        added = [
-            (-1 - row if k == 0 else row, *pair)
-            for row, entries in by_row.items()
-            for k, pair in enumerate(zip(entries[::2], [*entries[1::2], (zeros, n)], strict=False))
-        ]
-        pairs = [
-            (weight, *pair)
-            for weight, entries in sorted(by_weight.items())
-            for pair in zip(entries[::2], [*entries[1::2], (zeros, n * (n + 1))], strict=False)
-        ]
-        return cls(
-            bins,
-            _blocks([last.real, last.imag], blocks).reshape(blocks, 2 * BLOCK),
-            _paired([pair for _, *pair in added], blocks),
-            *_numbers(added),
-            _paired([pair for _, *pair in pairs], blocks),
-            *_numbers(pairs),
-        )
+        blocks = last.size // BLOCK
+        basis, row, place, first = _in_pairs(by_row, n, blocks)
+        products, weight, target, _ = _in_pairs(by_weight, n * (n + 1), blocks)
+        both = _blocks([last.real, last.imag], blocks).reshape(blocks, 2 * BLOCK)
+        return cls(bins, both, basis, np.where(first, -1 - row, row), place, products, weight, target)
 
 
-def _paired(pairs: list[list[tuple[FloatArray, int]]], blocks: int) -> FloatArray:
-    """(blocks, pairs, 2 BLOCK)."""
-    rows = _blocks([values for pair in pairs for values, _ in pair], blocks)
-    return rows.reshape(blocks, len(pairs), 2 * BLOCK)
+def _in_pairs(
+    by_row: dict[int, list[tuple[FloatArray, int]]], nowhere: int, blocks: int
+) -> tuple[FloatArray, IntArray, IntArray, BoolArray]:
+    """(blocks, pairs, 2 BLOCK) values in pairs of one row, that row, places (pairs, 2), and which is the first.
 
-
-def _numbers(pairs: list[tuple]) -> tuple[IntArray, IntArray]:
-    """(pairs,) first entries, (pairs, 2) last entries of both."""
+    A last one that has no partner gets zeros, to be put `nowhere`.
+    """
+    rest = [(np.zeros(blocks * BLOCK), nowhere)]
+    pairs = [
+        (row, k, first, second)
+        for row, entries in sorted(by_row.items())
+        for k, (first, second) in enumerate(zip(entries[::2], entries[1::2] + rest, strict=False))
+    ]
+    values = _blocks([values for *_, first, second in pairs for values, _ in (first, second)], blocks)
     return (
-        np.array([first for first, *_ in pairs], np.int64),
-        np.array([[place for _, place in pair] for _, *pair in pairs], np.int64).reshape(-1, 2),
+        values.reshape(blocks, len(pairs), 2 * BLOCK),
+        np.array([row for row, *_ in pairs], np.int64),
+        np.array([[first[1], second[1]] for *_, first, second in pairs], np.int64).reshape(-1, 2),
+        np.array([k == 0 for _, k, *_ in pairs], bool),
     )
 
 
