@@ -377,14 +377,7 @@ def transient_lines(each: ComplexArray, g: ComplexArray) -> slice | None:
 
     Noise and stochastic distortion are independent from line to line, the spectrum of a transient is
     smooth. Products of neighbours have mean 0 and bring their own variance then, so that lines and
-    realisations may differ in noise.
-
-    Parameters
-    ----------
-    each : (..., M, 2, F) complex
-        Spectra [Y; U] of the realisations.
-    g : (..., F) complex
-        Mean response.
+    realisations may differ in noise. Of spectra [Y; U] (..., M, 2, F) and the mean response (..., F).
     """
     error = each[..., 0, :] - g[..., None, :] * each[..., 1, :]  # (..., M, F)
     records, size = error.shape[-2], power(error)

@@ -68,11 +68,14 @@ def find_excited_harmonics(record: Spectrum) -> IntArray:
     harmonics = np.arange(1, (samples - 1) // 2 + 1)  # (H,)
     line_power = power_of_bins[harmonics * periods]  # (H,)
     records = u.shape[0]
-    threshold = (
-        _noise_threshold_single_period(line_power, records)
-        if periods == 1
-        else _noise_threshold_between(power_of_bins, harmonics, periods, records)
-    )
+    if periods == 1:
+        # the lower quartile over all lines is the median of the weaker half; were half of the lines
+        # excited, it is still a level that noise reaches
+        low = special.gammaincinv(records, 0.25)
+        high = special.gammainccinv(records, _FALSE_ALARM / line_power.size)
+        threshold = np.quantile(line_power, 0.25) * high / low
+    else:
+        threshold = _noise_threshold_between(power_of_bins, harmonics, periods, records)
     candidate = line_power > threshold
     level_db = 10 * np.log10(np.maximum(line_power, np.finfo(float).tiny))
     if periods == 1 and not np.any(candidate):
@@ -144,13 +147,3 @@ def _noise_threshold_between(
     # the ratio of two exponential means is F distributed
     quantile = special.fdtri(2 * records, 2 * bins * records, 1 - _FALSE_ALARM / harmonics.size)
     return np.asarray(quantile * local)
-
-
-def _noise_threshold_single_period(line_power: FloatArray, records: int) -> float:
-    """Level that a line of noise alone hardly exceeds, from the weaker half of the lines."""
-    # the lower quartile over all lines is the median of the weaker half; were half of the lines
-    # excited, it is still a level that noise reaches
-    noise = np.quantile(line_power, 0.25)
-    low = special.gammaincinv(records, 0.25) / records
-    high = special.gammainccinv(records, _FALSE_ALARM / line_power.size) / records
-    return float(noise * high / low)

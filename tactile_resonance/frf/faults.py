@@ -222,8 +222,8 @@ def missing_samples(x: _Channel) -> Fault | None:
     same = some[1:] == some[:-1]
     if not np.any(same[2:] & same[1:-1] & same[:-2]):
         return None  # of what is held for longer than a cycle, four of these are neighbours
-    starts, lengths = _runs(record)
-    value = record[starts]
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(record) != 0) + 1])
+    lengths, value = np.diff(np.append(starts, record.size)), record[starts]
     # a clipped peak is held too, but that is saturation
     held = (lengths > cycle) & (value != record.max()) & (value != record.min())
     if record.max() == record.min():
@@ -470,9 +470,3 @@ def _clipped(record: FloatArray, periods: int) -> int:
     one, next_one = top // periods, -(-following // periods)
     chance = special.bdtrc(one - 1, one + next_one, SHARE_AT_TOP) if one else 1.0
     return top if chance < _FALSE_ALARM else 0
-
-
-def _runs(record: FloatArray) -> tuple[IntArray, IntArray]:
-    """First index and length of each run of equal samples."""
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(record) != 0) + 1])
-    return starts, np.diff(np.append(starts, record.size))

@@ -90,20 +90,11 @@ def chances_of(
 ) -> FloatArray:
     """(K,) probability that noise makes a power as large as that of each bin, from those around.
 
-    Parameters
-    ----------
-    power : (K,) float
-        Means over records.
-    kinds : list of (K,) bool
-        First excited lines, then kinds of other harmonics, last the bins between, with noise alone.
-        Harmonics may hold distortion: they are compared with the larger level of their own kind and of
-        the noise. Other harmonics that are few of their kind are compared with the excited ones, and not
-        tested where there are none.
-    records : int
-    least : (K,) float or float
-        Level of rounding.
-    most_dof : float
-        Complex degrees of freedom of what the powers were divided by.
+    Of powers (K,) that are means over records, divided by what has `most_dof` complex degrees of freedom;
+    rounding has a level `least`. The kinds (K,) are first excited lines, then kinds of other harmonics, last
+    the bins between, with noise alone. Harmonics may hold distortion: they are compared with the larger level
+    of their own kind and of the noise. Other harmonics that are few of their kind are compared with the
+    excited ones, and not tested where there are none.
     """
     chance = np.ones(power.size)
     levels = [level_around(power, kind, records, WINDOW) for kind in kinds]

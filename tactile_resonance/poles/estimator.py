@@ -256,22 +256,12 @@ def _plan(
 def _poles_with_all_bins(
     plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch
 ) -> Poles | None:
-    """Poles from all bins of one point where the input between harmonics moves the output.
+    """Poles from all bins u, y (K,) or (M, K) of one point where the input between harmonics moves the output.
 
-    Parameters
-    ----------
-    plan : JointPlan
-    u, y : (K,) or (M, K) complex
-        At its bins; of M realisations for a plan of these.
-    batch : PolesBatch
-        Its fit to the excited lines, shape (). A model error found on these by cost or whiteness stays:
-        bins that noise alone moves have found it. Unless it took the disturbance for noise: a fit to all
-        bins then leaves next to nothing of that. A disturbance looks like terms that the model lacks.
-
-    Returns
-    -------
-    Poles or None
-        None where the excited lines are all there is; see `DISTURBED` and `EXPLAINED`.
+    None where the excited lines are all there is; see `DISTURBED` and `EXPLAINED`. A model error found on these
+    by cost or whiteness stays: bins that noise alone moves have found it. Unless it took the disturbance for
+    noise: a fit to all bins then leaves next to nothing of that. A disturbance looks like terms that the model
+    lacks.
     """
     wrong = batch.status() is PolesStatus.MODEL_ERROR and not np.isfinite(batch.lacking[0])
     if batch.status() is PolesStatus.TOO_FEW_LINES or plan.others_at.size == 0:

@@ -148,23 +148,10 @@ def systematic_of(
     """Outer products of what halves of the data, and one mode more, move each pole by where a model is wrong.
 
     Halves are those of the driven bins and, of several records, the first and the last ones. Where one of
-    these fits has no such mode, or does not determine it, half its width stands for all: what lies nearer to a
-    mode looks like part of it.
-
-    Parameters
-    ----------
-    plan : FitPlan
-    data : BinData
-    theta : (points, M, n) float
-        Of the fit, where those to halves begin.
-    wrong : (points,) bool
-    plan_of_theta : FitPlan, optional
-        Over whose bases the coefficients are, where not of `plan`.
-
-    Returns
-    -------
-    (points, places, 2, 2) float
-        In (f0_hz, damping_ratio); 0 where the model is not wrong.
+    these fits has no such mode, or does not determine it, half its width stands for all: what lies nearer to
+    a mode looks like part of it. (points, places, 2, 2) in (f0_hz, damping_ratio), 0 where the model is not
+    `wrong` (points,). Fits to halves begin with theta (points, M, n), over bases of `plan_of_theta`, if not
+    `plan`.
     """
     systematic = np.zeros((wrong.size, plan.structure.order // 2, 2, 2))
     if not wrong.any():
@@ -237,22 +224,10 @@ def difference_of_models(
 ) -> FloatArray:
     """Outer product of what a model with one mode more moves each pole by in (f0_hz, damping_ratio).
 
-    Two modes nearer to each other than their widths are fitted by one between them so well that
-    residuals say little about how far it is from either.
-
-    Parameters
-    ----------
-    poles_rad_s : (..., places) complex
-    richer_rad_s : (..., more places) complex
-        NaN where there is no mode; the nearest one counts.
-    covariance : (..., more places, 2, 2) float
-        Of (f0_hz, damping_ratio) of the latter.
-
-    Returns
-    -------
-    (..., places, 2, 2) float
-        With the covariance of the nearest one; NaN where the richer model has no mode, or knows it no better
-        than to half the width of the pole.
+    Two modes nearer to each other than their widths are fitted by one between them so well that residuals say
+    little about how far it is from either. (..., places, 2, 2), of poles (..., places) and those of the
+    richer model, of which the nearest one counts, with its covariance (2, 2); NaN where there is none, or one
+    known no better than to half the width of the pole.
     """
     distance = np.abs(richer_rad_s[..., None, :] - poles_rad_s[..., None])  # (..., places, more)
     nearest = np.argmin(np.where(np.isfinite(distance), distance, np.inf), axis=-1)

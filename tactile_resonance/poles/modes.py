@@ -135,20 +135,10 @@ def significant_modes(
 ) -> tuple[BoolArray, FloatArray]:
     """Modes that noise alone would not make; those whose covariance is not known are kept.
 
-    A fit to noise finds the line or bin that stands out most: the residue's Mahalanobis distance from
-    zero, chi-square with two degrees of freedom, is the largest of about as many as there are lines
-    (Bonferroni).
-
-    Parameters
-    ----------
-    model : RationalModel
-    quantities : dict
-        Of `pole_quantities`.
-    coefficients : (batch, n, n) float
-        Covariance of the free coefficients; NaN where it is not known.
-    lines : (batch,) int
-    dof : (batch,) float, optional
-        Complex degrees of freedom where the level is that of the residuals; infinite elsewhere.
+    A fit to noise finds the line or bin that stands out most: the residue's Mahalanobis distance from zero,
+    chi-square with two degrees of freedom, is the largest of about as many as there are lines (Bonferroni).
+    Of `pole_quantities`, with a covariance (batch, n, n) of the free coefficients, NaN where it is not known,
+    and complex `dof` (batch,) where the level is that of the residuals; infinite elsewhere.
 
     Returns
     -------

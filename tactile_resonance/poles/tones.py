@@ -154,24 +154,10 @@ def poles_without_tones(
 ) -> tuple[PolesBatch, tuple[Tone, ...]]:
     """Poles of one point, bins with a tone left out and what leaks out of them taken off.
 
-    A tone on the only line that shows a narrow mode cannot be distinguished from response.
-
-    Parameters
-    ----------
-    plan : JointPlan
-        That leaves out none.
-    u, y : (K,) or (M, K) complex
-        At the bins of its band.
-    batch : PolesBatch
-        Its fit, shape ().
-
-    Returns
-    -------
-    PolesBatch
-        Of shape ().
-    tuple of Tone
-        By frequency; none where so many bins, or neighbouring excited lines, stand out that something
-        other than tones is wrong, or where the fit without them finds no minimum.
+    A tone on the only line that shows a narrow mode cannot be distinguished from response. Of bins u, y (K,)
+    or (M, K) of a plan that leaves out none, and its fit, shape (). Tones are by frequency; none where so
+    many bins, or neighbouring excited lines, stand out that something other than tones is wrong, or where the
+    fit without them finds no minimum.
     """
     taken: list[_Taken] = []
     whole = fitted = _Fitted(plan, batch, np.atleast_2d(u), np.atleast_2d(y))
