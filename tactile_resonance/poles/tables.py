@@ -130,10 +130,10 @@ class Part(NamedTuple):
         for k, values in enumerate((last.real, last.imag)):
             by_row[ROW_A + k].append((values, n))
         blocks = last.size // BLOCK
-        basis, row, place, first = _in_pairs(by_row, n, blocks)
-        products, weight, target, _ = _in_pairs(by_weight, n * (n + 1), blocks)
+        values, rows, place, first = _in_pairs(by_row, n, blocks)
         both = _blocks([last.real, last.imag], blocks).reshape(blocks, 2 * BLOCK)
-        return cls(bins, both, basis, np.where(first, -1 - row, row), place, products, weight, target)
+        of_products = _in_pairs(by_weight, n * (n + 1), blocks)[:3]
+        return cls(bins, both, values, np.where(first, -1 - rows, rows), place, *of_products)
 
 
 def _in_pairs(
