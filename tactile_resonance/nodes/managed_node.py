@@ -163,6 +163,13 @@ class ManagedNode(LifecycleNode):
         # in the node's own group, whose callbacks exclude each other, one that waits would keep all waiting
         group = ReentrantCallbackGroup()
         service = self.create_service(kind, name, callback, callback_group=group)
+        send = service.send_response
+
+        def send_if_there(response: Any, header: Any) -> None:
+            with contextlib.suppress(InvalidHandle):  # cleaned up while the callback waited
+                send(response, header)
+
+        service.send_response = send_if_there
         self.resources.callback(self.destroy_service, service)
 
     def serve_trigger(self, name: str, do: Callable[[], str | Awaitable[str]]) -> None:
