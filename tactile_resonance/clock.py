@@ -54,6 +54,7 @@ class ToBench(IntEnum):
     SEED = 4  # up to three integers, from which all noise follows from now on
     PORTS = 5  # local ports of the connections to the robot's RTDE server and to the cell's bus
     WAKE = 6  # time [ns] that is to be reported when it is reached; it does not hold time up
+    ANNOUNCE = 7  # as HOLD, before the packets are sent
 
 
 class FromBench(IntEnum):
@@ -208,6 +209,10 @@ class SimulatedClock(Clock):
         all of them before its next step. Below 0 it states nothing.
         """
         self._send(ToBench.HOLD, min(until_ns, ENDLESS_NS), demand, packets)
+
+    def announce(self, until_ns: int, demand: Demand, packets: int) -> None:
+        """As `hold`, before the packets are sent: they are waited for as long as this takes part."""
+        self._send(ToBench.ANNOUNCE, until_ns, demand, packets)
 
     def free(self, demand: Demand = Demand.NONE) -> None:
         """Let time go on without a limit."""

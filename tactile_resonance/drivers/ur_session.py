@@ -175,7 +175,7 @@ class Session:
         ):
             raise ArmError(ArmFault.COMMAND_REFUSED, f"setPayload {config.payload_kg} was refused")
         self._settle()
-        self._limit_time(packets=1)
+        self._limit_time(announced=1)
         if not control.setWatchdog(config.watchdog_hz):
             raise ArmError(ArmFault.COMMAND_REFUSED, "setWatchdog was refused")
         self._limit_time()
@@ -188,16 +188,16 @@ class Session:
             # this reports to the session itself, also while the loop receives the times it waits for
             self._clock.sleep_until(self._clock.ask_ns() + round(2e9 / CONTROL_HZ))
 
-    def _limit_time(self, packets: int = 0) -> None:
+    def _limit_time(self, announced: int = 0) -> None:
         """A watchdog counts as soon as it is set: simulated time waits for the library before it expires.
 
         It stands until so many packets have come: the robot does what it is told within the limit, however
-        late this process sends it.
+        late this process sends it. One that never does is ended by its owner, and time goes on.
         """
         if self._clock is not None:
             self._clock.hold(0, Demand.REAL, 0)
             limit_ns = self._clock.ask_ns() + round(0.75e9 / self.config.watchdog_hz)
-            self._clock.hold(limit_ns, Demand.REAL, packets)
+            self._clock.announce(limit_ns, Demand.REAL, announced)
 
     def _check_remote(self) -> None:
         config = self.config

@@ -9,6 +9,7 @@ come at the pace of real time, and time for which the machine stood still is los
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ STALL_S = 0.010
 REPEAT_S = 0.05
 """While time stands the newest data are sent again after so long, on this machine's clock [s]."""
 PACKETS_WITHIN_S = 0.5
-"""A packet that was announced is waited for so long, on this machine's clock [s]."""
+"""A packet that was sent is waited for so long, on this machine's clock [s]."""
 
 
 @dataclass(eq=False)
@@ -38,6 +39,7 @@ class Participant:
     until_ns: int = ENDLESS_NS
     demand: Demand = Demand.NONE
     told_ns: int = -1  # until_ns that was reported to it
+    announces: bool = False  # packets that it has not sent yet
     wake_ns: int = ENDLESS_NS
     robot_port: int = 0
     bus_port: int = 0
@@ -133,11 +135,14 @@ class BenchTime:
                 self._take(participant, ToBench(kind), *integers)
         finally:
             self._participants.remove(participant)
+            if participant.announces:
+                self._packets_due = 0
 
     def _take(self, participant: Participant, kind: ToBench, a: int, b: int, c: int) -> None:
-        if kind is ToBench.HOLD:
+        if kind in (ToBench.HOLD, ToBench.ANNOUNCE):
             participant.until_ns, participant.demand, participant.told_ns = a, Demand(b), -1
-            self._expect(c)
+            participant.announces = kind is ToBench.ANNOUNCE
+            self._expect(c, math.inf if participant.announces else PACKETS_WITHIN_S)
             self.tell_reached()
         elif kind is ToBench.WAKE:
             participant.wake_ns = a
@@ -152,7 +157,7 @@ class BenchTime:
         else:
             participant.robot_port, participant.bus_port = a, b
 
-    def _expect(self, packets: int) -> None:
+    def _expect(self, packets: int, within_s: float) -> None:
         """Make no step before so many packets have come since 0 was stated; below 0 nothing is stated."""
         if packets < 0:
             return
@@ -160,7 +165,7 @@ class BenchTime:
             self._packets_mark, self._packets_due = self.packets_arrived() or 0, 0
         elif self._packets_mark >= 0:
             self._packets_due = self._packets_mark + packets
-            self._packets_late_s = time.monotonic() + PACKETS_WITHIN_S
+            self._packets_late_s = time.monotonic() + within_s
 
     # how far time may go
 

@@ -111,6 +111,7 @@ def test_the_watchdog_is_set_within_the_time_that_it_allows_however_late_that_is
         config,
         SimpleNamespace(
             hold=lambda *how: said.append(how),
+            announce=lambda *how: said.append(("announced", *how)),
             ask_ns=lambda: now_ns,
             sleep_until=lambda time_ns: None,
         ),
@@ -125,8 +126,8 @@ def test_the_watchdog_is_set_within_the_time_that_it_allows_however_late_that_is
     session._prepare()
     stands = (0, Demand.REAL, 0)  # while the limit is asked for
     assert said == [
-        *(stands, (limit_ns, Demand.REAL, 1), config.watchdog_hz),
-        *(stands, (limit_ns, Demand.REAL, 0)),
+        *(stands, ("announced", limit_ns, Demand.REAL, 1), config.watchdog_hz),
+        *(stands, ("announced", limit_ns, Demand.REAL, 0)),
     ]
 
 

@@ -264,6 +264,26 @@ def test_packets_that_were_lost_are_waited_for_once(bench, conductor, monkeypatc
     assert clock.now_ns() == begun_ns + 2 * STEP_NS
 
 
+@pytest.mark.parametrize("is_gone", [False, True])
+def test_packets_that_are_announced_are_waited_for_until_they_come_or_nobody_is_there_to_send_them(
+    bench, conductor, monkeypatch, is_gone
+):
+    monkeypatch.setattr(bench_time, "PACKETS_WITHIN_S", 0.0)  # of those that were sent
+    arrived = [100]
+    bench.time.packets_arrived = lambda: arrived[0]
+    clock, other = bench.join("hand"), bench.join("other")
+    other.free(Demand.FAST)
+    clock.hold(0, Demand.NONE, 0)
+    begun_ns = clock.ask_ns()
+    clock.announce(ENDLESS_NS, Demand.NONE, 1)
+    assert stands(clock) == (True, begun_ns)
+    if is_gone:
+        clock.close()
+    else:
+        arrived[0] += 1
+    goes_on(other)
+
+
 def test_seeds_reach_who_makes_noise(bench, conductor):
     got = []
     bench.time.seeds.append(got.append)
