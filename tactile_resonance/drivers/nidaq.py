@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ import numpy.typing as npt
 from numpy.polynomial import polynomial
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.clock import WallClock
 from tactile_resonance.drivers.acquisition import (
     AcquiredBlock,
     AcquisitionDevice,
@@ -231,7 +231,7 @@ class NiDaqDevice(AcquisitionDevice):
         self._drive = np.empty(0)
         self._maybe_on = False  # until 0 V has been written
         self._index = 0
-        self._start_ns = 0
+        self._clock, self._start_ns = WallClock(), 0
         self._closed = False
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
@@ -313,7 +313,8 @@ class NiDaqDevice(AcquisitionDevice):
                 self._maybe_on = True
                 self._output.start()
                 self._input.start()
-                self._start_ns = time.time_ns()
+                self._clock = WallClock()
+                self._start_ns = self._clock.now_ns()
 
     def read_block(self, timeout_s: float) -> AcquiredBlock:
         """The next period, whole; on any error the output is set to 0 V first."""
@@ -337,7 +338,7 @@ class NiDaqDevice(AcquisitionDevice):
             channels.insert(0, Channel(self._drive))
         block = AcquiredBlock(
             self._index,
-            self._start_ns + round(self._index * excitation.period_s * 1e9),
+            self._clock.ros_ns(self._start_ns + round(self._index * excitation.period_s * 1e9)),
             channels[0],
             channels[1],
         )

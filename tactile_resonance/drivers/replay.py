@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from tactile_resonance.clock import WallClock
 from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
@@ -56,8 +56,7 @@ class ReplayDevice:
         self._measurement: StoredMeasurement | None = None
         self._blocks: dict[int, Record] = {}
         self._armed: Excitation | None = None
-        self._start_s = 0.0
-        self._start_ns = 0
+        self._clock, self._start_ns = WallClock(), 0
         self._index = 0
         self._stopped = threading.Event()
         self._closed = False
@@ -148,8 +147,8 @@ class ReplayDevice:
             raise DeviceError("replay: nothing armed to play")
         self._next = self._next_after
         self._index = 0
-        self._start_s = time.monotonic()
-        self._start_ns = time.time_ns()
+        self._clock = WallClock()
+        self._start_ns = self._clock.now_ns()
         self._stopped.clear()
 
     def interrupt(self) -> None:
@@ -163,8 +162,8 @@ class ReplayDevice:
             raise DeviceError("replay: nothing plays")
         index = self._index
         if self._speed > 0:
-            due_s = self._start_s + (index + 1) * excitation.period_s / self._speed
-            wait_s = due_s - time.monotonic()
+            passed_s = (self._clock.now_ns() - self._start_ns) * 1e-9
+            wait_s = (index + 1) * excitation.period_s / self._speed - passed_s
             if self._stopped.wait(max(0.0, min(wait_s, timeout_s))):
                 raise DeviceError("replay: stopped")
             if wait_s > timeout_s:
@@ -180,10 +179,10 @@ class ReplayDevice:
                 f"{record.sensor.samples.size} samples, expected one period of {n}"
             )
         self._index += 1
-        passed_ns = round(index * excitation.period_s * 1e9)
+        begun_ns = self._start_ns + round(index * excitation.period_s * 1e9)
         return AcquiredBlock(
             index,
-            record.origin.time_ns or self._start_ns + passed_ns,
+            record.origin.time_ns or self._clock.ros_ns(begun_ns),
             record.actuator,
             record.sensor,
             record.origin.contact,

@@ -2,6 +2,7 @@
 """The NI driver on a stand-in of nidaqmx; nothing here has seen hardware."""
 
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tactile_resonance.clock import WallClock
 from tactile_resonance.configuration import share_path
 from tactile_resonance.drivers.acquisition import DeviceError
 from tactile_resonance.drivers.nidaq import CountScale, NiDaqConfig, NiDaqDevice
@@ -39,6 +41,21 @@ def armed(config=CONFIG, excitation=EXCITATION):
     device.configure(planned.sample_rate_hz)
     device.arm(planned)
     return device
+
+
+def test_where_the_machines_time_is_set_blocks_keep_to_the_clock_of_the_forces(hardware, monkeypatch):
+    """contact_node finds the forces of a block by its stamp, on its own relation of the clocks."""
+    device, forces = armed(), WallClock()
+    begun_ns = forces.now_ns()
+    device.play()
+    ahead_ns = time.time_ns() - time.monotonic_ns()
+    for set_s in (0.0, 3600.0, -3600.0):
+        shifted_ns = ahead_ns + round(set_s * 1e9)
+        monkeypatch.setattr(time, "time_ns", lambda by_ns=shifted_ns: time.monotonic_ns() + by_ns)
+        block = device.read_block(1.0)
+        block_ns = begun_ns + round(block.index * EXCITATION.period_s * 1e9)
+        assert forces.own_ns(block.time_ns) == pytest.approx(block_ns, abs=60e9)
+    device.stop()
 
 
 def test_periods_come_whole_from_rest_and_in_order(hardware):

@@ -221,6 +221,24 @@ def test_a_plain_file_is_one_measurement(tmp_path, lines):
         device.plan(ASKED)
 
 
+def test_where_the_machines_time_is_set_blocks_of_a_file_keep_to_the_monotonic_clock(
+    tmp_path, monkeypatch
+):
+    excitation = design_multisine(sample_rate_hz=1000.0, samples_per_period=100, band_hz=(20.0, 200.0))
+    u = np.tile(excitation.period(), (3, 1))
+    np.savez(tmp_path / "m.npz", u=u, y=u, sample_rate_hz=1000.0)
+    device = ReplayDevice(tmp_path / "m.npz", speed=0)
+    (planned,) = device.plan(ASKED)
+    device.arm(planned)
+    device.play()
+    ahead_ns = time.time_ns() - time.monotonic_ns() + 3600 * 10**9
+    monkeypatch.setattr(time, "time_ns", lambda: time.monotonic_ns() + ahead_ns)
+    for n in range(3):
+        begun_s = 1e-9 * (device.read_block(1.0).time_ns - time.time_ns())
+        assert begun_s == pytest.approx(n * excitation.period_s, abs=10.0)
+    device.stop()
+
+
 def test_a_file_that_names_no_period_is_refused(tmp_path):
     """As one period it would tell no noise."""
     excitation = design_multisine(sample_rate_hz=1000.0, samples_per_period=100, band_hz=(20.0, 200.0))
