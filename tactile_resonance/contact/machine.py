@@ -326,10 +326,15 @@ class ContactController:
     def _rise(
         self, now_ns: int, arm: ArmSample | None, fault: ArmError | ForceError | None
     ) -> None:
-        """Go on to the usual standoff where that is asked for, or no goal came for a while."""
+        """Go on to the usual standoff where that is asked for, or no goal came for a while.
+
+        After a fault of the arm, and where it is where it may not be, only where it is asked for.
+        """
         wished, self._wish_retract = self._wish_retract, False
         waited = now_ns - self._state_ns > LINGER_NS
-        if fault is None and (wished or waited) and self._envelope.judge_arm(now_ns, arm) is None:
+        if isinstance(fault, ArmError) or self._envelope.judge_arm(now_ns, arm) is not None:
+            self._stays = True
+        elif fault is None and (wished or (waited and not self._stays)):
             self._free.rest_m, self._rising = self._usual_m, True
             self._enter(State.RETRACT, now_ns)
 

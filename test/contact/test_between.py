@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.goal import Aim, ContactGoal, State
-from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.interfaces import ArmFault, Mount
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
@@ -159,6 +159,37 @@ def test_tip_that_waits_low_rises_at_once_where_it_is_asked_to():
     assert not rig.controller.settled
     rig.run(0.6)
     assert rig.controller.settled
+    assert height_m(rig) == pytest.approx(P.standoff_m, abs=1e-4)
+
+
+@pytest.mark.parametrize("for_s", [0.1, 3.0])
+def test_tip_that_waits_low_rises_after_a_fault_of_the_arm_only_where_it_is_asked_to(for_s):
+    rig = made()
+    states(rig, goal(rig, 0.0, LOW_M))
+    rig.run(0.2)  # the arm comes to rest
+    before_m = height_m(rig)
+    rig.bench.arm.halt(ArmFault.PROTECTIVE_STOP)
+    rig.run(for_s)
+    rig.bench.arm.repair()
+    rig.bench.arm.connect()
+    rig.run(3.0)
+    assert height_m(rig) == pytest.approx(before_m, abs=2e-5)
+    _, result, _ = states(rig, goal(rig, 5e-3, LOW_M))
+    assert result.reached
+    rig.run(2.0)  # of a contact since, nothing was wrong
+    assert height_m(rig) == pytest.approx(P.standoff_m, abs=1e-4)
+
+
+def test_tip_that_waits_low_after_a_fault_of_the_arm_rises_where_it_is_asked_to():
+    rig = made()
+    states(rig, goal(rig, 0.0, LOW_M))
+    rig.bench.arm.break_link(ArmFault.LINK_LOST)
+    rig.run(0.1)
+    rig.bench.arm.repair()
+    rig.bench.arm.connect()
+    rig.run(2.0)
+    rig.controller.retract()
+    rig.run(0.6)
     assert height_m(rig) == pytest.approx(P.standoff_m, abs=1e-4)
 
 
