@@ -289,8 +289,8 @@ class TouchRequest:
     tolerance_m : float
         By which a touch may lie off the form fitted through all [m].
     search_m : float
-        So far above and below the expected height each of the first three touches is searched for [m], from
-        above in steps; 0: as far as one contact searches.
+        So far above and below the expected height each touch is searched for [m], from above in steps, until
+        the plane through those before is known to 0.4 mm there; 0: as far as one contact searches.
     """
 
     points_m: tuple[tuple[float, float], ...]

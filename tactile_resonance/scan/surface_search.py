@@ -14,6 +14,7 @@ and a circle of 2 mm. Four touches or more leave nothing of that, and check each
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -40,6 +41,8 @@ LEAST_TOUCH_STD_M = 2e-5
 # Less than the height from which a contact comes down: each step begins where the one before found nothing. A
 # contact that searches less than that finds the surface early and is refused.
 SEARCH_STEP_M = 2e-3
+# Known better than this a plane tells where the next touch meets it, within what one contact searches.
+KNOWN_STD_M = SEARCH_STEP_M / 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +183,7 @@ def find_surface(
     """Touch all places of a request and fit its form: the surface, and the touches it rests on.
 
     The first place is expected at the height that the request states, the others where those before suggest: on
-    their plane as soon as it is known. Before, surfaces are searched for as far as the request says.
+    their plane as soon as it is known there. Before, surfaces are searched for as far as the request says.
 
     Parameters
     ----------
@@ -200,9 +203,8 @@ def find_surface(
     turn = tuple(tip_orientation(UP, heading_rad).tolist())
     touches: list[Touch] = []
     for index, (x, y) in enumerate(request.points_m):
-        height = _expected(touches, (x, y), request.expected_height_m, ball_radius_m)
+        height, search_m = _expected(touches, (x, y), request, ball_radius_m)
         label = f"surface, touch {index + 1}"
-        search_m = request.search_m if len(touches) < 3 else 0.0
         steps = 1 + math.ceil(2 * search_m / SEARCH_STEP_M)
         heights = height + np.linspace(search_m, -search_m, steps)
         points = [ScanPoint(index, (x, y, z), UP, turn, label) for z in heights.tolist()]
@@ -249,17 +251,19 @@ def _first_found(points: Sequence[ScanPoint], touch: Callable[[ScanPoint], Touch
 
 
 def _expected(
-    touches: Sequence[Touch], xy_m: tuple[float, float], height_m: float, ball_radius_m: float
-) -> float:
-    """Height at which the next touch is expected: on the plane through those before, else as configured."""
+    touches: Sequence[Touch], xy_m: tuple[float, float], request: TouchRequest, ball_radius_m: float
+) -> tuple[float, float]:
+    """Height at which the next touch is expected [m], and how far about it the surface is searched for [m].
+
+    On the plane through those before and no further, where that is known; else about the last one, or as asked.
+    """
     if len(touches) >= 3:
-        try:
-            return float(fit_touches(touches, "plane", ball_radius_m).height_m(xy_m))
-        except ValueError:  # on one line: no plane yet
-            pass
-    if touches:
-        return touches[-1].ball_m[2] - ball_radius_m
-    return height_m
+        with contextlib.suppress(ValueError):  # on one line: no plane yet
+            plane = fit_touches(touches, "plane", ball_radius_m)
+            if plane.height_std_m(xy_m) < KNOWN_STD_M:
+                return float(plane.height_m(xy_m)), 0.0
+    height_m = touches[-1].ball_m[2] - ball_radius_m if touches else request.expected_height_m
+    return height_m, request.search_m
 
 
 def find_normals(

@@ -127,6 +127,38 @@ def test_a_steep_table_is_found_before_its_plane_is_known():
         find_surface(TouchRequest(SQUARE, "plane"), RADIUS_M, 0.0, touch)
 
 
+def test_touches_of_a_grid_are_searched_for_until_they_are_no_row():
+    """The plane through a row is unknown beside it: 4 mm from the end of one to the begin of the next."""
+    slope = np.array([0.15, -0.1])
+
+    def touch(point):
+        made = ball_on_plane(slope, 0.0)(point)
+        return contact_from(made.ball_m[2] - RADIUS_M)(point)
+
+    grid = tuple((x, y) for y in (-0.01, 0.0, 0.01) for x in (-0.01, 0.0, 0.01))
+    found, _ = find_surface(TouchRequest(grid, "plane", search_m=8e-3), RADIUS_M, 0.0, touch)
+    np.testing.assert_allclose(found.coefficients_m[1:] / found.scale_m, slope)
+
+
+def test_no_touch_is_expected_far_below_a_surface_where_a_plane_is_known_badly():
+    """Three touches within a millimetre tell nothing 15 mm off: the tip would travel into the tissue."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        told = []
+
+        def touch(point, told=told):
+            x, y, z = point.position_m
+            told.append(z)
+            if z > 2e-3:
+                raise SurfaceMissing("surface_missing")
+            return Touch((x, y, RADIUS_M + 5e-5 * rng.normal()), 5e-5, 0.005)
+
+        around = rng.uniform(-5e-4, 5e-4, (3, 2)).tolist()
+        points = tuple(tuple(xy) for xy in [*around, [15e-3, 0.0], [0.0, 15e-3]])
+        find_surface(TouchRequest(points, "plane", search_m=5e-3), RADIUS_M, 0.0, touch)
+        assert min(told) > -2e-3
+
+
 def test_a_surface_that_is_nowhere_in_reach_is_refused():
     missing = contact_from(-8e-3)
     with pytest.raises(PointFailed, match="touch 1: surface_missing below -0.0050"):
