@@ -275,9 +275,8 @@ class FakeHardwareNode(ManagedNode):
             (seed,) = values(self, "seed")
             # noise repeats with the excitation's own seed, whatever was played before
             entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
-            self._touch.take_up()
-            tip, so_far = self._touch.tip, None
-            pressed = self._touch.plant is not None and tip.tissue is not None
+            tip, so_far = self._touch.take_up(), None
+            pressed = tip.tissue is not None and self._touch.creeps
             if pressed and not effects.nonlinearity:  # which takes the contact as fixed
                 so_far = ContactSoFar(self._bench, tip)
             coupled = tip.coupled(self._bench) if so_far is None else so_far.coupled_at
@@ -306,9 +305,7 @@ class FakeHardwareNode(ManagedNode):
         place = request.position
         try:
             self.require_active()
-            if request.here:
-                self._touch.take_up()
-            tip = self._touch.tip if request.here else self._touch.at((place.x, place.y, place.z))
+            tip = self._touch.take_up() if request.here else self._touch.at((place.x, place.y, place.z))
             coupled = replace(
                 tip,
                 force_n=request.force_n or tip.force_n,
@@ -330,16 +327,20 @@ class FakeHardwareNode(ManagedNode):
     ) -> Callable[[int], None]:
         """What makes and publishes a block at its end: only then is it known what became of the contact.
 
-        A contact of the plant (`pressed`) has its truth with every block: the mean over all blocks so far, with
+        A contact that creeps (`pressed`) has its truth with every block: the mean over all blocks so far, with
         the stamp that their poles will have.
         """
         touch, blocks = self._touch, run.play(excitation, excitation.periods)
-        pose, tip = touch.stays.newest.pose, touch.tip
+        pose, tip = touch.stays.newest.pose_at(start_ns), touch.tip
         block_ns = round(excitation.period_s * 1e9)
 
         def hand_out(end_ns: int) -> None:
             if so_far is not None:
-                so_far.extend(excitation.period_s, touch.contact_over(end_ns - block_ns, end_ns))
+                if touch.plant is None:
+                    states = so_far.held(excitation.period_s)
+                else:
+                    states = touch.contact_over(end_ns - block_ns, end_ns)
+                so_far.extend(excitation.period_s, states)
             if pressed:
                 parts = [run.coupled] if so_far is None else so_far.parts
                 pose.header.stamp = time_message((start_ns + end_ns) // 2)

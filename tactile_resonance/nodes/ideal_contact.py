@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ideal contact through the interfaces of contact_node, to try a stack without a 500 Hz loop.
 
-The tip is where a goal puts it, after a fixed time, and the force is exactly the one asked for. There is no
-robot, no load cell and no control law behind it, and none of their errors.
+The tip is where a goal puts it, after a fixed time, and the force is exactly the one asked for; the contact
+creeps under it. There is no robot, no load cell and no control law behind it, and none of their errors.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class IdealContact:
             missing = not_reached(Cause.SURFACE_MISSING, "nothing to touch there")
             return self._say(State.IDLE, missing)
         now_ns = self._tip.now_ns()
-        self._tip.place(Stay(now_ns, request.force_n, request.pose))
+        self._tip.place(Stay(now_ns, request.force_n, request.pose), began_ns)
         took_s, (depth_m, surface_m) = (now_ns - began_ns) * 1e-9, found
         reached = ContactResult(
             reached=True,

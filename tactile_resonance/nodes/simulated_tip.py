@@ -231,6 +231,7 @@ class SimulatedTip:
         table, self.frame_id = values(node, "table_in_base", "frame_id")
         self._laid = LaidScene(scene, pose_of(table, "table_in_base"))
         self.tip, self.stays, self.stalls = BenchTip(None, 0.0, 1.0), Stays(), 0
+        self._touched_ns: int | None = None  # of an ideal contact, which creeps from then on
         self._in_scene = False  # whether `tcp_pose` is in the frame of the scene, and not in the base
         self.truths = node.publish_on(msg.Poles, "bench/truth", TRUTHS)
         if plant is not None:
@@ -257,10 +258,15 @@ class SimulatedTip:
         tissue = scene.tissue_at(place) if self._in_scene else self._laid.tissue_at(place)
         return BenchTip(tissue, scene.force_n, 1.0)
 
-    def take_up(self) -> None:
-        """With a robot: the contact as it is now, and its truth; raises ValueError."""
+    @property
+    def creeps(self) -> bool:
+        """Whether time changes a contact: a robot holds the tip, or it is ideal and of known age."""
+        return self.plant is not None or self._touched_ns is not None
+
+    def take_up(self) -> BenchTip:
+        """Return the tip as it is now; with a robot that is its truth from now on; raises ValueError."""
         if self.plant is None:
-            return
+            return replace(self.tip, since_s=self._since_s(self.now_ns()))
         try:
             true = self.plant.ask("truth")
         except OSError as error:
@@ -278,6 +284,7 @@ class SimulatedTip:
         place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self.now_ns())
         self._plant_ahead_s = true["time_s"] - place.time_ns * 1e-9
         self._put(Stay(place.time_ns, force_n, pose_to_message(place)), tip)
+        return tip
 
     def contact_over(self, from_ns: int, to_ns: int) -> list[ContactState | None]:
         """The contact over an interval, as fine as the sensor follows it, of a block of more than 10 s coarser.
@@ -314,12 +321,19 @@ class SimulatedTip:
         height_m, _ = self._laid.surface().height_of(place_m)
         return float(contact.indentation_m), -float(height_m)
 
-    def place(self, stay: Stay) -> None:
-        """Put the tip somewhere; in air where its force is 0."""
+    def place(self, stay: Stay, touched_ns: int | None = None) -> None:
+        """Put the tip somewhere, on what it has touched since a ROS time [ns]; in air where its force is 0."""
         stay = replace(stay, pose=stay.pose_at(stay.since_ns))
         point = stay.pose.pose.position
         tissue = self._laid.tissue_at(np.array([point.x, point.y, point.z]))
-        self._put(stay, BenchTip(tissue if stay.force_n else None, stay.force_n, 1.0))
+        self._touched_ns = touched_ns
+        tip = BenchTip(tissue if stay.force_n else None, stay.force_n, self._since_s(stay.since_ns))
+        self._put(stay, tip)
+
+    def _since_s(self, now_ns: int) -> float:
+        """Age of contact at a ROS time [s]: of unknown age 1 s; above 0, also on a clock that was set back."""
+        touched_ns = self._touched_ns
+        return 1.0 if touched_ns is None else max(0.002, (now_ns - touched_ns) * 1e-9)
 
     def _on_pose(self, message: PoseStamped) -> None:
         if message == self.stays.newest.pose:

@@ -17,10 +17,12 @@ from tactile_resonance.srv import Play
 from tactile_resonance import msg
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.nodes.fake_hardware_node import EFFECTS, FakeHardwareNode
-from tactile_resonance.nodes.messages import excitation_to_message
+from tactile_resonance.nodes.messages import excitation_to_message, pose_to_message
 from tactile_resonance.nodes.running import RESULTS, initialised
+from tactile_resonance.nodes.simulated_tip import Stay
 from tactile_resonance.processes import free_domain_id
-from tactile_resonance.recording.messages import record_from_message
+from tactile_resonance.record import Contact
+from tactile_resonance.recording.messages import record_from_message, time_from_message
 from tactile_resonance.simulation.plant.defaults import MOST_STEPS, TABLE_IN_BASE
 from tactile_resonance.simulation.plant.tabletop import PlantHistory
 from tactile_resonance.simulation.sensor.bench import (
@@ -135,6 +137,27 @@ def test_a_sensor_that_is_not_linear_plays_on_the_contact_whose_truth_is_told(no
     np.testing.assert_allclose(record_from_message(blocks[0]).sensor.volts(), want, rtol=0, atol=1e-9)
     assert truths[-1].measurement_id == 3
     np.testing.assert_allclose(truths[-1].f0_hz, [mode.f0_hz for mode in run.truth().modes])
+
+
+def test_an_ideal_contact_has_crept_by_as_much_as_the_age_that_is_told(node):
+    touch, place = node._touch, Contact(position_m=TABLE_IN_BASE[:3], frame_id="base")
+    now_ns = touch.now_ns()
+    touched_ns = now_ns - 3 * 10**9
+    touch.place(Stay(now_ns, 0.008, pose_to_message(place)), touched_ns)
+    truths, blocks = [], []
+    touch.truths.publish, node._blocks.publish = truths.append, blocks.append
+    assert asked(node, excitation_id=7, measurement_id=3, periods=1).accepted
+    touch.place(Stay(touch.now_ns(), 0.0, pose_to_message(place)))  # drawn back: what plays is of the contact
+    assert spin_until(SingleThreadedExecutor(), lambda: blocks)
+    (truth,) = [each for each in truths if each.measurement_id == 3]
+    age_s = (time_from_message(truth.header.stamp) - touched_ns) * 1e-9
+    bench, gel = SimulatedBench.from_configuration(), read_tissues()["gel10"]
+    old, of_1_s = (
+        [m.f0_hz for m in bench.coupled(gel, force_n=0.008, hold_time_s=t).modes] for t in (age_s, 1.0)
+    )
+    np.testing.assert_allclose(truth.f0_hz, old, rtol=1e-5)
+    assert np.abs(np.subtract(truth.f0_hz, of_1_s)).max() > 0.08
+    assert truth.contact_force_n == pytest.approx(0.008)
 
 
 def test_contact_over_a_long_block_is_asked_for_in_as_many_parts_as_are_answered(node):

@@ -209,7 +209,8 @@ def test_a_contact_is_made_held_told_and_drawn_back(ideal):
     }  # none before the tip is placed
     assert ideal.states[-1].force_n == FORCE_N
     # what the bench knows of a place is asked for in the frame of tcp_pose too
-    told = ideal.truth(here=True), ideal.truth(position=goal_at().pose.pose.position)
+    at_1_s = {"hold_time_s": 1.0}
+    told = ideal.truth(here=True, **at_1_s), ideal.truth(position=goal_at().pose.pose.position)
     assert [(each.tissue, list(each.f0_hz)) for each in told] == [("gel10", told[0].f0_hz.tolist())] * 2
     now_ns = time.time_ns()
     assert ideal.force_over(made_ns, now_ns).force_n == FORCE_N

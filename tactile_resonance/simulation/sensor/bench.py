@@ -19,7 +19,12 @@ from tactile_resonance.fields import check_not_negative, require
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.sensor import SensorParameters, read_sensor
-from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, VaryingStream, couple
+from tactile_resonance.simulation.sensor.bimorph import (
+    CoupledBimorph,
+    VaryingStream,
+    couple,
+    parts_of,
+)
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
 from tactile_resonance.simulation.sensor.response import (
     Lines,
@@ -429,6 +434,23 @@ class ContactSoFar:
             last = self.parts[-1] if self.parts else self._start
             self.parts.append(last if state is None else self._coupled(state))
             self._ends_s.append(begin + length_s * number / len(states))
+
+    def held(self, length_s: float) -> list[ContactState]:
+        """Return what follows for so long if the force of the start is held: creep as in `hertz_contact`."""
+        tip, parts = self._tip, parts_of(length_s)
+        assert tip.tissue is not None
+        begin_s = tip.since_s + (self._ends_s[-1] if self._ends_s else 0.0)
+        states = []
+        for since_s in (begin_s + (np.arange(parts) + 0.5) * length_s / parts).tolist():
+            contact = hertz_contact(
+                tip.tissue,
+                self._bench.sensor.tip.radius_m,
+                self._bench.contact,
+                force_n=tip.force_n,
+                hold_time_s=since_s,
+            )
+            states.append((contact.force_n, contact.contact_radius_m, contact.indentation_m))
+        return states
 
     def coupled_at(self, time_s: float) -> CoupledBimorph:
         """Return the linear sensor on the contact of one time [s]."""

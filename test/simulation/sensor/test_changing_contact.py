@@ -186,6 +186,20 @@ def test_poles_follow_the_force_part_by_part(bench, library):
     assert so_far.coupled_at(0.115) is so_far.parts[2]
 
 
+def test_a_force_that_is_held_creeps_on_as_hertz_contact(bench, library):
+    cortex = library["cortex"]
+    so_far = ContactSoFar(bench, BenchTip(cortex, 0.008, 0.5))
+    for length_s in (0.4, 1.0):
+        so_far.extend(length_s, so_far.held(length_s))
+    middles_s = 0.02 + np.arange(35) * 0.04
+    found = [near_250(so_far.coupled_at(t)) for t in middles_s]
+    hertz = [
+        near_250(bench.coupled(cortex, force_n=0.008, hold_time_s=0.5 + t)) for t in middles_s.tolist()
+    ]
+    np.testing.assert_allclose(found, hertz, rtol=1e-12)
+    assert found[0] - found[-1] > 0.3
+
+
 def test_a_plant_that_stands_still_keeps_its_contact_and_a_lost_one_is_nearly_air(bench, library):
     gel = library["gel10"]
     so_far = ContactSoFar(bench, BenchTip(gel, 0.01, 1.0))
