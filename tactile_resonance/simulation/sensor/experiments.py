@@ -217,14 +217,15 @@ def records_of_calibration(
         *(("mass", m) for m in masses_kg),
         *(("spring", k) for k in springs_n_per_m),
     ]
-    made = []
-    for index, (kind, value) in enumerate([*loads, ("loopback", 0.0)]):
+    made, loads = [], [*loads, ("loopback", 0.0)]
+    noise_seeds = np.random.SeedSequence([seed, 12]).generate_state(len(loads), np.uint64).tolist()
+    for noise_seed, (kind, value) in zip(noise_seeds, loads, strict=True):
         coupled = couple(bench.sensor, _known_load(kind, value) if value else None)
         if kind == "loopback":
             nothing = np.zeros(0, complex)
             wire = PoleResidueModel(nothing, nothing, 1.0)  # both channels on the generator
             coupled = SimpleNamespace(modal=wire)  # type: ignore[assignment]
-        run = BenchRun(bench.sensor, coupled, seed + index, effects)
+        run = BenchRun(bench.sensor, coupled, noise_seed, effects)
         run.block(excitation, settling)
         block = run.block(excitation, periods)
         u, y = (

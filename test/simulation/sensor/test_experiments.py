@@ -1,11 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from tactile_resonance.frf.distortion import estimate_distortion
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.frf.variance_analysis import PAPER_AXES, nested_means
-from tactile_resonance.simulation.sensor.experiments import records_at_levels, repeated_records
+from tactile_resonance.simulation.sensor import experiments
+from tactile_resonance.simulation.sensor.bench import SimulatedBench
+from tactile_resonance.simulation.sensor.experiments import (
+    records_at_levels,
+    records_of_calibration,
+    repeated_records,
+)
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +62,23 @@ def test_sources_of_variance_come_in_the_papers_order():
     assert np.all(np.diff(levels) > 0)
     assert levels[-1] < -25
     assert [source.dof for source in reversed(found.levels)] == [27, 18, 6, 2]
+
+
+def test_records_of_calibrations_with_neighbouring_seeds_share_no_noise(monkeypatch):
+    seeds = []
+
+    class Silent:
+        def __init__(self, sensor, coupled, seed, effects):
+            seeds.append(seed)
+
+        def block(self, excitation, periods):
+            silence = np.zeros(periods * excitation.samples_per_period)
+            channel = SimpleNamespace(volts=lambda: silence)
+            return SimpleNamespace(actuator=channel, sensor=channel)
+
+    monkeypatch.setattr(experiments, "BenchRun", Silent)
+    bench = SimulatedBench.from_configuration()
+    for seed in (1, 2, 3, 1):
+        records_of_calibration(bench, seed=seed)
+    assert len(set(seeds)) == 9  # air, a mass and a loop-back of each seed
+    assert seeds[9:] == seeds[:3]
