@@ -35,7 +35,7 @@ from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import TissueLibrary
 
 KEEP_STEPS = 30_000
-"""A minute at 500 Hz."""
+"""A minute at 500 Hz; a block of the simulated sensor that is longer loses the beginning of its contact."""
 
 
 class _PlantStep(NamedTuple):
