@@ -64,28 +64,23 @@ class OnSoft(ABC):
         """Its part of `tangent`."""
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
-        """See `Indenter.swing`; in shorter steps where the ball meets what is stiff."""
+        """See `Indenter.swing`."""
         base_m, rate_m_s = base
         for n in range(count):
-            parts = self._parts(beam, ball, h_s)
-            for part in range(parts):
-                base_now_m = base_m + (n + part / parts) * h_s * rate_m_s
-                short_s = h_s / parts
-                ball = swing(*self.tangent(short_s), *ball, base_now_m, rate_m_s, short_s, *beam)
-                self.step(ball[0], short_s)
+            base_now_m = base_m + n * h_s * rate_m_s
+            ball = swing(*self.tangent(h_s), *ball, base_now_m, rate_m_s, h_s, *beam)
+            self.step(ball[0], h_s)
         return ball
 
-    def _parts(self, beam: Beam, ball: Motion, h_s: float) -> int:
-        """Steps that a swing over a time takes."""
-        return 1
+    def stiffness_at(self, depth_m: float) -> float:
+        """See `Indenter.stiffness_at`."""
+        return self._soft.stiffness_at(depth_m)
 
 
 Ball = Indenter | OnSoft
 """What presses on the tip."""
 
 BONE_PA, BONE_POISSON_RATIO = 10e6, 0.3
-TURN_RAD = 0.2
-"""Of a swing on bone in a step."""
 
 
 class OnBone(OnSoft):
@@ -119,12 +114,10 @@ class OnBone(OnSoft):
     def _act(self, up_m_s: float) -> float:
         return self._ahead(0.0)[0]
 
-    def _parts(self, beam: Beam, ball: Motion, h_s: float) -> int:
-        """By the stiffness of the bone as deep as the ball may come: it turns by `TURN_RAD` in each."""
-        depth_m, speed_m_s = ball
-        inside_m = depth_m + abs(speed_m_s) * h_s - self._layer_m
-        stiffness = 1.5 * self._c * math.sqrt(max(0.0, inside_m))
-        return max(1, ceil(h_s * math.sqrt(stiffness / beam[2]) / TURN_RAD))
+    def stiffness_at(self, depth_m: float) -> float:
+        """Of both."""
+        bone = 1.5 * self._c * math.sqrt(max(0.0, depth_m - self._layer_m))
+        return super().stiffness_at(depth_m) + bone
 
     def _ahead(self, dt_s: float) -> tuple[float, float]:
         """Force of the bone and its slope (Hertz)."""
@@ -166,6 +159,8 @@ class Clinging(OnSoft):
 
 
 SUBSTEP_S = 5e-4  # a twentieth of the period of the mode on stiff gelatine
+TURN_RAD = 0.2
+"""Of a swing in a sub-step, at most, on what is the stiffer the deeper it is."""
 
 
 @dataclass(frozen=True)
@@ -241,13 +236,16 @@ class SprungIndenter:
             require(False, "dt_s", dt_s, "a number above 0")
         if self._base is None:
             self._base = self.tip_depth_m = base_depth_m
-        count = ceil(dt_s / SUBSTEP_S - 1e-9)
+        k, c, m = self._beam
+        push_n = k * (max(self._base, base_depth_m) - self.tip_depth_m) - self.indenter.force_n
+        fastest_m_s = abs(self._speed) + max(0.0, push_n) / m * dt_s
+        stiffest = self.indenter.stiffness_at(self.tip_depth_m + fastest_m_s * dt_s)
+        count = ceil(max(dt_s / SUBSTEP_S, dt_s * sqrt(stiffest / m) / TURN_RAD) - 1e-9)
         rate = (base_depth_m - self._base) / dt_s
         depth, speed = self.indenter.swing(
             self._beam, (self._base, rate), (self.tip_depth_m, self._speed), dt_s / count, count
         )
         self._base, self.tip_depth_m, self._speed = base_depth_m, depth, speed
-        k, c, _ = self._beam
         self.force_n = k * (base_depth_m - depth) + c * (rate - speed)
         return self.force_n
 

@@ -440,6 +440,7 @@ class Indenter:
         pull = (1 - poisson_ratio**2) * sqrt(2 * pi * work * plane_modulus)
         # tissue undisturbed, the tip far above it
         self.force_n, self.contact_radius_m, self.depth_m = 0.0, 0.0, -np.inf
+        self._stiffness = 2 * e0 / (1 - poisson_ratio**2) * sqrt(tip_radius_m)
         self._state = np.zeros(1, STATE)
         for name, value in {
             **{"radius_m": tip_radius_m, "spacing_m": NODE_SPACING * tip_radius_m},
@@ -471,6 +472,10 @@ class Indenter:
         To first order the force after a step is ``force + stiffness (depth - present depth)``.
         """
         return _tangent(self._state, self._terms, dt_s)
+
+    def stiffness_at(self, depth_m: float) -> float:
+        """Return the force per further depth [N/m] at a depth [m] that is reached at once, without adhesion."""
+        return self._stiffness * sqrt(max(0.0, depth_m))
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
         """Move at the end of a beam for `count` times `h_s`, as the function `swing`; return its motion."""

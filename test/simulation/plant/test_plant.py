@@ -253,16 +253,20 @@ def test_beam_keeps_swinging_while_the_tip_comes_down_along_a_tilt():
     assert len(made) == 1
 
 
-def test_bone_neither_gives_nor_takes_energy_of_a_ball_on_the_beam():
-    # moved above the bone in one step, the ball swings and hits it; the base stands
-    hardly_there = Tissue("air", 1.0, (), ())
+@pytest.mark.parametrize("elastic_pa", [None, 5e4, 2e5, 1e6])  # None: bone
+@pytest.mark.parametrize("above_m", [1e-4, 5e-4])
+def test_what_is_elastic_neither_gives_nor_takes_energy_of_a_ball_on_the_beam(elastic_pa, above_m):
+    # moved above it in one step, the ball swings and hits it; the base stands
+    tissue = Tissue("elastic", elastic_pa or 1.0, (), ())
+    ball = Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=NU)
+    plane_pa = tissue.relaxation_modulus_1s_pa / (1 - NU**2)
+    if elastic_pa is None:
+        ball = OnBone(ball, layer_m=0.0, radius_m=RADIUS_M)
+        plane_pa = BONE_PA / (1 - BONE_POISSON_RATIO**2)
     k, m = 14.8, 2.65e-4
-    bone = OnBone(
-        Indenter(hardly_there, tip_radius_m=RADIUS_M, poisson_ratio=NU), layer_m=0.0, radius_m=RADIUS_M
-    )
-    tip = SprungIndenter(bone, stiffness_n_per_m=k, mass_kg=m, damping_ns_per_m=0.0)
-    base_m, stiffness = -5e-5, 4 / 3 * BONE_PA / (1 - BONE_POISSON_RATIO**2) * np.sqrt(RADIUS_M)
-    tip.step(base_m - 1e-4, 0.002)
+    tip = SprungIndenter(ball, stiffness_n_per_m=k, mass_kg=m, damping_ns_per_m=0.0)
+    base_m, stiffness = -5e-5, 4 / 3 * plane_pa * np.sqrt(RADIUS_M)
+    tip.step(base_m - above_m, 0.002)
     energy, hits = [], 0
     for _ in range(200):
         tip.step(base_m, 0.002)
@@ -271,7 +275,7 @@ def test_bone_neither_gives_nor_takes_energy_of_a_ball_on_the_beam():
         swing = k / 2 * (base_m - depth_m) ** 2 + m / 2 * tip._speed**2
         energy.append(swing + 2 / 5 * stiffness * max(0.0, depth_m) ** 2.5)
     assert hits > 5
-    np.testing.assert_allclose(energy, energy[0], rtol=0.03)
+    np.testing.assert_allclose(energy, energy[0], rtol=0.05)
 
 
 def test_not_stepped_is_said():
