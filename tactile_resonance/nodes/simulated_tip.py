@@ -47,6 +47,7 @@ from tactile_resonance.simulation.plant.defaults import MOST_STEPS, PRIORITY, RE
 from tactile_resonance.simulation.plant.surfaces import LaidScene
 from tactile_resonance.simulation.sensor.bench import BenchTip, ContactState, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, parts_of
+from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import PhantomScene
 from tactile_resonance.srv import ForceOver
 from tactile_resonance.srv import Truth as TruthService
@@ -274,9 +275,12 @@ class SimulatedTip:
         self.stalls, force_n = true["stalls"], true["normal_force_n"]
         tip = BenchTip(None, force_n, true["contact_s"] or 1.0)
         if force_n > 0:
+            tissue = self._laid.tissue_at(np.array(true["site_m"] or true["tip_m"]))
+            if tissue is None or tissue.name != true["tissue"]:  # another was placed there by an order
+                tissue = read_tissues()[true["tissue"]]
             tip = replace(
                 tip,
-                tissue=self._laid.tissue_at(np.array(true["site_m"] or true["tip_m"])),
+                tissue=tissue,
                 contact_radius_m=true["contact_radius_m"],
                 depth_m=true["depth_m"],
             )

@@ -2,6 +2,7 @@
 """The bench's service to play an excitation: asked once more, and what it plays on."""
 
 import os
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import record_from_message, time_from_message
 from tactile_resonance.simulation.plant.defaults import MOST_STEPS, TABLE_IN_BASE
-from tactile_resonance.simulation.plant.tabletop import PlantHistory
+from tactile_resonance.simulation.plant.plant import Plant
+from tactile_resonance.simulation.plant.tabletop import PlantHistory, Tabletop
 from tactile_resonance.simulation.sensor.bench import (
     BenchEffects,
     BenchRun,
@@ -110,6 +112,7 @@ class Held:
 
     STATE = {
         **{"time_s": 5.0, "tip_m": TABLE_IN_BASE[:3], "site_m": TABLE_IN_BASE[:3], "stalls": 0},
+        "tissue": "gel10",
         **{"normal_force_n": 0.008, "contact_s": 3.0, "contact_radius_m": 1.1e-3, "depth_m": 4e-4},
     }
     alive = True
@@ -137,6 +140,16 @@ def test_a_sensor_that_is_not_linear_plays_on_the_contact_whose_truth_is_told(no
     np.testing.assert_allclose(record_from_message(blocks[0]).sensor.volts(), want, rtol=0, atol=1e-9)
     assert truths[-1].measurement_id == 3
     np.testing.assert_allclose(truths[-1].f0_hz, [mode.f0_hz for mode in run.truth().modes])
+
+
+def test_tissue_that_an_order_placed_is_what_the_sensor_is_on(node, monkeypatch):
+    plant = Plant(None, None, None, tip_radius_m=2.5e-3)
+    plant.tissue = read_tissues()["cortex"]
+    told = Tabletop.truth(SimpleNamespace(plant=plant), {})["tissue"]
+    monkeypatch.setattr(Held, "STATE", Held.STATE | {"tissue": told})
+    node._touch.plant = Held()
+    node._touch.take_up()
+    assert node._touch.tip.tissue == read_tissues()["cortex"]
 
 
 def test_an_ideal_contact_has_crept_by_as_much_as_the_age_that_is_told(node):

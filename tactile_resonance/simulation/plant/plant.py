@@ -94,6 +94,8 @@ class Plant:
         Place of the frame `tip` in the base [m].
     site_m : Vector or None
         Where the tissue was asked for last.
+    tissue : Tissue or None
+        That was found there.
     normal_force_n : float
         True force along the normal [N], compression positive.
     """
@@ -125,7 +127,7 @@ class Plant:
         self.tip_m = ORIGIN
         self.normal_force_n = 0.0
         self._tip = tip
-        self._tissue: Tissue | None = None
+        self.tissue: Tissue | None = None
         self._on: TipOnTissue | None = None
         self.site_m: Vector | None = None
         self._site_touched = False
@@ -229,9 +231,9 @@ class Plant:
             if known:
                 return
         tissue = self.tissue_at(np.array(place))
-        if tissue != self._tissue or self._site_touched:  # else the beam goes on swinging
+        if tissue != self.tissue or self._site_touched:  # else the beam goes on swinging
             self._on = None if tissue is None else self._tip(tissue)
-        self._tissue = tissue
+        self.tissue = tissue
         self.site_m, self._site_touched = place, False
 
     def _friction(self, way: Vector, normal: Vector, pushed: float) -> Vector:

@@ -210,7 +210,9 @@ class Tabletop:
             *("time_s", "tip_m", "site_m", "force_n", "normal_force_n", "contact_s", "depth_m"),
             *("contact_radius_m", "in_contact", "touches"),
         )
-        return {name: getattr(self.plant, name) for name in names}
+        tissue = self.plant.tissue
+        told = {name: getattr(self.plant, name) for name in names}
+        return told | {"tissue": None if tissue is None else tissue.name}
 
 
 def attach(robot: SimulatedRobot, tabletop: Tabletop) -> None:
