@@ -98,8 +98,7 @@ class FreeMotion:
 
     def lifts(self, arm: ArmSample) -> bool:
         """Whether it goes straight up to the standoff: it stands lower, beside the surface or on it."""
-        standoff_m = self._parameters.standoff_m
-        return self._turning is None and self._path.must_lift(arm, standoff_m)
+        return self._turning is None and self._path.must_lift(arm, self._parameters.standoff_m)
 
     def judge_way(self, arm: ArmSample) -> Breach | None:
         """Whether the tip is near the way of this goal, from where it was first seen."""

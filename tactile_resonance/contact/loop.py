@@ -156,10 +156,11 @@ class ContactLoop:
             pose = self._pose = arm or self._pose
             if felt and pose is not None:
                 goal, mounting = self.controller.goal, self._force.mounting
-                turn = turn_from_vector(pose.rotation_rad)
                 if goal is not None and mounting.mount is Mount.TABLE:
-                    # that its weight, which goes with the tare, does not turn with a tip that is put right
+                    # so that the weight on it, part of its zero, does not turn with a tip that is put right
                     turn = goal.touch.turn
+                else:
+                    turn = turn_from_vector(pose.rotation_rad)
                 wrenches = mounting.to_tip(felt, pose.position_m, turn)
         self._seen, self.fault = arm, fault
         # the arm keeps a velocity, so a stop is sent until it has worked, whatever state that ends in
