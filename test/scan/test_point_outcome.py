@@ -10,6 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tactile_resonance.cli import main
+from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.goal import State
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.run_report import as_page, summary
@@ -55,9 +57,10 @@ def mode(estimate, covariance):
     ],
 )
 def test_a_run_tells_whether_its_poles_come_through_a_calibrated_sensor(
-    tmp_path, method, message, calibrated
+    tmp_path, capsys, method, message, calibrated
 ):
-    with RunDirectory.create(tmp_path / "run", "name: x\n", plan(3), {}) as run:
+    text = share_path("config/scenes/demo.yaml").read_text()
+    with RunDirectory.create(tmp_path / "run", text, plan(4), {}) as run:
         record_point(run, 0)
         assert is_calibrated(run.content) is None
         for index, modes in enumerate(([], [250.0]), start=1):  # where nothing was estimated nothing is said
@@ -67,6 +70,10 @@ def test_a_run_tells_whether_its_poles_come_through_a_calibrated_sensor(
                 recording.write("/poles", POLES_TYPE, START_NS, to_cdr(poles))
                 recording.finish(run_tables.result(index))
         assert is_calibrated(run.content) is calibrated
+    if calibrated:  # it is not gone on with as if it were none
+        assert main(["resume", str(run.path)]) == 1
+        refused = "--calibration: got 'none'; accepted is the file with which the run began"
+        assert refused in capsys.readouterr().err
 
 
 def test_uncertainty_relative_to_air_is_that_of_both():
