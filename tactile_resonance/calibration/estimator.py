@@ -49,9 +49,9 @@ LOUDEST = 9.0
 """Of the noise of the calibration, as power: what is more than that between lines is a transient that does not
 fit, as of another sensor, and must not widen the deviations until nothing contradicts the calibration."""
 _STEPS, _FIRST_STEP = 300, 0.2
-"""Of the fit; the first one in logarithms and an exponent: it would overshoot, and a power law that leaves its
-exponents stays there."""
-_ENOUGH = 1e-7  # by which the weighted squares fall
+"""Of the fit; longest first step, in logarithms and an exponent: a longer one overshoots, and a power law that
+leaves its exponents stays there."""
+_ENOUGH = 1e-7  # part of the weighted squares by which the last step lowers them
 _NEAR = (0.2, 5.0)
 """Of the ends of the band: poles between them have a state of their own where that at the start is unknown."""
 FEWEST_LINES = 3
@@ -296,7 +296,7 @@ class _Fit:
         return self._descend(p)
 
     def _descend(self, p: FloatArray) -> tuple[FloatArray, bool]:
-        found = optimize.least_squares(  # of a way from 0 its first step is as long as the scale
+        found = optimize.least_squares(  # dogbox begins with steps of `x_scale` only where its start is 0
             lambda way: self.residual(p + way),
             np.zeros(p.size),
             lambda way: slope_of(self.residual, p + way),

@@ -291,9 +291,9 @@ class SimulatedTip:
         return tip
 
     def contact_over(self, from_ns: int, to_ns: int) -> list[ContactState | None]:
-        """The contact over an interval, as fine as the sensor follows it, of a block of more than 10 s coarser.
+        """The contact over an interval, as fine as the sensor follows it; over more than 10 s it is coarser.
 
-        Unchanged where the plant ended.
+        None where the plant ended: the contact stays as it was.
         """
         assert self.plant is not None
         from_s, to_s = (ns * 1e-9 + self._plant_ahead_s for ns in (from_ns, to_ns))

@@ -29,7 +29,7 @@ Plan = TypeVar("Plan", bound=FitPlan)
 
 # Beyond this the parameters have no figure left in double precision.
 LARGEST_CONDITION_NUMBER = 1e12
-# Of the variance of a delay, by what else is not known: beyond, its deviation says little of it.
+# Of the variance of a delay by what is not known of other coefficients: beyond it, its deviation means little.
 MOST_INFLATION = 100.0
 # Of `Judged.kind`.
 NAMES = np.array([*KINDS, "unknown", ""])

@@ -163,11 +163,11 @@ def boundary_of_run(run: RunContent) -> RunBoundary | None:
 
 
 def true_f0_hz(
-    phantoms: PhantomScene, asked: Adaptive, near_hz: float, hold_time_s: float = 1.0
+    phantoms: PhantomScene, asked: Adaptive, near_hz: float, hold_time_s: float
 ) -> np.ndarray:
     """(r, c) true f0 of the mode near a frequency over the raster of a region [Hz]; NaN where nothing lies.
 
-    Interpolated within what one region of the phantoms would be if it were everywhere: their edges stay sharp.
+    Each region of the phantoms is interpolated as if it were everywhere, so that edges stay sharp.
     """
     xy_m = asked.raster.xy_m
     low, high = asked.polygon_m.min(axis=0), asked.polygon_m.max(axis=0)
@@ -175,13 +175,13 @@ def true_f0_hz(
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     bench, there = SimulatedBench.from_configuration(), phantoms.region_index(xy_m)
     found = np.full(there.shape, math.nan)
-    for index in set(there[there >= 0].tolist()):
+    for index in np.unique(there[there >= 0]):
         alone = replace(phantoms, regions=(replace(phantoms.regions[index], shape=_EVERYWHERE),))
         felt = truth_over(bench, alone, at, hold_time_s=hold_time_s)
         sensors: list[Any] = felt.ravel().tolist()
         values = np.reshape([each.mode_near(near_hz).f0_hz for each in sensors], felt.shape)
-        of_region = RegularGridInterpolator(axes, values, method="cubic")(xy_m)
-        found = np.where(there == index, of_region, found)
+        here = there == index
+        found[here] = RegularGridInterpolator(axes, values, method="cubic")(xy_m[here])
     return found
 
 

@@ -94,7 +94,8 @@ def table(names: Sequence[str], rows: Sequence[str], all_in: str = "") -> str:
     head, body = _row("th", names, names), "".join(rows[:MOST_ROWS])
     more = len(rows) - MOST_ROWS
     left_out = f"{counted(more, 'further row is', 'further rows are')} left out here"
-    told = paragraphs([f"{left_out}; {all_in} has all." if all_in else f"{left_out}."][: more > 0])
+    whole = f"; {all_in} has all" if all_in else ""
+    told = paragraphs([f"{left_out}{whole}."]) if more > 0 else ""
     return (
         f'<div class="wide"><table><thead>{head}</thead><tbody>{body}</tbody></table></div>{told}'
     )

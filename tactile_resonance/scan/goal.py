@@ -98,9 +98,9 @@ def named_frames(goal: ScanGoal, frames: Frames) -> tuple[str, ...]:
 
 
 def read_goal(goal: ScanGoal, frames: Frames) -> tuple[Plan, str, Path | None]:
-    """Plan of the scene that a goal for a new run asks for, that scene as a file, and the file of its surface.
+    """Plan and text of the scene that a goal for a new run asks for, and the file of its surface, if any.
 
-    Both with what the goal has in place of the file's; the scene file expects that of its surface beside it.
+    Plan and text have what the goal gives in place of the scene's. The text expects the file beside it.
 
     Raises
     ------

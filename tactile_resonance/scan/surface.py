@@ -362,10 +362,7 @@ def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface
 
 
 def with_file_beside(fields: object, folder: Path) -> tuple[Any, Path | None]:
-    """A scene's section ``surface`` for a copy of the scene beside which its file lies, and that file.
-
-    None where it names none.
-    """
+    """A scene's section ``surface`` as it names its file beside the scene, and that file; None: it has none."""
     for form, value in fields.items() if isinstance(fields, Mapping) else ():
         if isinstance(value, Mapping) and isinstance(value.get("file"), str):
             path = folder / value["file"]
