@@ -154,8 +154,9 @@ def scan_goal(message: Scan.Goal) -> ScanGoal:
         + (p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w)
         for p in message.poses.poses
     )
-    given = {each.name: getattr(message, each.name, None) for each in fields(ScanGoal)}
-    return ScanGoal(**{**given, "poses": poses, "frame_id": message.poses.header.frame_id})
+    names = [each.name for each in fields(ScanGoal) if each.name not in ("poses", "frame_id")]
+    given = {name: getattr(message, name) for name in names}
+    return ScanGoal(poses=poses, frame_id=message.poses.header.frame_id, **given)
 
 
 def scan_feedback(progress: Progress, run_directory: str) -> Scan.Feedback:
