@@ -208,7 +208,7 @@ class FakeHardwareNode(ManagedNode):
     `make_contact` puts the tip, which this node serves then; the force comes back on `wrench` and from the
     service `force_over`. What the
     simulation knows of the poles is on `bench/truth` (latched, all modes): under the tip as it is put
-    somewhere or an excitation begins; of a contact of the plant also with each block. In simulated time it
+    somewhere or an excitation begins; of a contact that creeps also with each block. In simulated time it
     publishes `/clock`.
     """
 
