@@ -149,8 +149,9 @@ def boundary_of_run(run: RunContent) -> RunBoundary | None:
         phantoms = read_scene(read_tissues(), run.path / "scene.yaml")
     except ValueError:  # simulated without a scene of the bench
         return found
-    hold_s = 1.0
-    if (nominal := scene.nominal_contact) is not None:  # to which poles were carried over
+    hold_s, nominal = 1.0, scene.nominal_contact
+    # as `known_points` takes poles
+    if nominal is not None and any(np.isfinite(result.nominal_f0_std_hz) for result in run.latest):
         phantoms, hold_s = replace(phantoms, force_n=nominal.force_n), nominal.age_s
     truth = true_f0_hz(phantoms, asked, boundary.level_set.levels[0], hold_s)
     surface = asked.krige(known_points(run.latest))

@@ -187,7 +187,8 @@ def test_a_row_of_points_has_no_surface_and_the_picture_says_why():
     assert texts == ["no surface: 5 points with a standard deviation, not on one line, are needed"]
 
 
-def test_the_boundary_drawn_is_that_of_boundary_json(tmp_path):
+@pytest.mark.parametrize("referred", [True, False])
+def test_the_boundary_drawn_is_that_of_boundary_json(tmp_path, referred):
     """Of an adaptive scan, whose scene states the region and the smallest thing that is looked for."""
     scene = share_path("config/scenes/demo.yaml")
     adaptive = read_scan_scene(scene).adaptive
@@ -203,14 +204,16 @@ def test_the_boundary_drawn_is_that_of_boundary_json(tmp_path):
             x_m, y_m, _ = point.position_m
             with run.begin_point(point.index) as recording:
                 result = result_of(point.index, f0_hz=float(f0_hz[point.index]))
-                recording.finish(replace(result, x_m=x_m, y_m=y_m))
+                nominal = {"nominal_f0_hz": result.f0_hz, "nominal_f0_std_hz": 0.01} if referred else {}
+                recording.finish(replace(result, x_m=x_m, y_m=y_m, **nominal))
     content = read_run(tmp_path / "run")
     of_run = boundary_of_run(content)
     found = of_run.boundary
     assert found.outline_m
     # of the contact to which the poles of the map refer
-    phantoms = replace(read_scene(read_tissues(), scene), force_n=0.012)
-    truth = true_f0_hz(phantoms, adaptive, found.level_set.levels[0], 3.0)
+    force_n, hold_s = (0.012, 3.0) if referred else (0.01, 1.0)
+    phantoms = replace(read_scene(read_tissues(), scene), force_n=force_n)
+    truth = true_f0_hz(phantoms, adaptive, found.level_set.levels[0], hold_s)
     want = adaptive.raster.lines(found.level_set.depth(truth))
     np.testing.assert_array_equal(np.concatenate(of_run.true_outline_m), np.concatenate(want))
     *_, (_, last) = told(write_map_recording(content), "/pole_map/markers")
