@@ -293,7 +293,8 @@ class ExcitationNode(ManagedNode):
         try:
             return device.read_block(timeout_s)
         finally:
-            self._read_by_s = float("inf")
+            if device is self._device:
+                self._read_by_s = float("inf")
 
     def _record(self, block: AcquiredBlock, excitation: Excitation, info: DeviceInfo) -> Record:
         last_period = block.index == excitation.periods - 1

@@ -147,7 +147,7 @@ def test_a_measurement_of_a_former_configuration_leaves_the_present_one_alone(mo
             node.trigger_cleanup()
             node.trigger_configure()
             node.trigger_activate()
-            node._measured = "another goal"
+            node._measured, node._read_by_s = "another goal", 12.0
             raise DeviceError("device: closed")
 
     made, ended = [], []
@@ -162,10 +162,10 @@ def test_a_measurement_of_a_former_configuration_leaves_the_present_one_alone(mo
         goal.abort = lambda: ended.append(goal)
         with pytest.raises(StopIteration):
             node._on_goal(goal).send(None)
-        measured, present = node._measured, list(made[1].asked)
+        measured, read_by_s, present = node._measured, node._read_by_s, list(made[1].asked)
         node.destroy_node()
     assert ended == [goal]
-    assert measured == "another goal"
+    assert (measured, read_by_s) == ("another goal", 12.0)
     assert made[0].asked[-2:] == ["close", "stop"]
     assert present == []
 
