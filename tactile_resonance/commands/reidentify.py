@@ -59,9 +59,11 @@ def run(options: argparse.Namespace) -> int:
         several = len(options.runs) > 1
         require(not several, "--output", None, "one name for the result of several runs")
         output = options.runs[0] / "reidentified"
-    of_run = (output.parent / "run.json").is_file() and output.name in ("results", "mechanics", "bins")
-    require(not of_run, "--output", str(output), "a name that no file of the run itself has")
     csv, npz = (output.with_name(output.name + ending) for ending in (".csv", ".npz"))
+    known = output.name in ("results", "mechanics", "bins")
+    taken = known or (npz.exists() and not csv.exists())  # by the heights of its surface
+    of_run = taken and (output.parent / "run.json").is_file()
+    require(not of_run, "--output", str(output), "a name that no file of the run itself has")
     begun_s = time.monotonic()
     with ProgressBar(unit_scale=True) as bar:
 

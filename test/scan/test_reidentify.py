@@ -261,13 +261,15 @@ def test_a_run_may_grow_while_its_bins_are_made(tmp_path):
 
 
 def test_what_it_refuses(runs, tmp_path, capsys):
-    none = [str(tmp_path / "none")]
+    none, heights = [str(tmp_path / "none")], runs[0] / "heights.npz"
+    heights.write_bytes(b"of its surface")
     cases = {
         "cannot be read as a run": [str(tmp_path)],
         "nowhere cannot be read as a run": [str(tmp_path / "nowhere")],
         "--output: got None; accepted is one name": [str(run) for run in runs],
         "--output: got": [str(runs[0]), "--output", str(tmp_path / "no" / "folder")],
         "a name that no file of the run": [str(runs[0]), "--output", str(runs[0] / "results")],
+        "a name that no file of the run itself": [str(runs[0]), "--output", str(heights.with_suffix(""))],
         "--band: got [300.0, 200.0]": [str(runs[0]), "--band", "300", "200"],
         "order: 0": [str(runs[0]), "--order", "0"],
         "holds 4 excited lines": [str(runs[0]), "--band", "249", "259"],
@@ -280,6 +282,7 @@ def test_what_it_refuses(runs, tmp_path, capsys):
         assert text in told
         assert told.count("\n") == 1
     assert not list(tmp_path.iterdir())
+    assert heights.read_bytes() == b"of its surface"
 
 
 def test_pieces_bound_what_is_held_at_a_time(runs, tmp_path, monkeypatch):
