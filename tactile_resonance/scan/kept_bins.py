@@ -270,10 +270,8 @@ def write_bins(
             "left_out": left_out,
         }
         write_array(members, "kinds", np.array(json.dumps(content)))
-    kinds_crc = _kinds_crc(members)
-    made = (
-        Piece(kind, run / NAME, *piece, kinds_crc) for kind in waiting for piece in pieces[kind]
-    )
+    crc = _kinds_crc(members)
+    made = (Piece(kind, run / NAME, *piece, crc) for kind in waiting for piece in pieces[kind])
     return KeptBins(tuple(made), tuple(left_out))
 
 

@@ -228,12 +228,9 @@ def energy_share(
     points, weights = energy_nodes()
     at_m = np.asarray(surface_point_m)
     inside = []
-    for part in points:
-        place_m = at_m + contact_radius_m * part
-        here = shape.contains(place_m)
-        for other in but:
-            here = here & ~other.contains(place_m)
-        inside.append(here)
+    for place_m in (at_m + contact_radius_m * part for part in points):
+        elsewhere = np.any([other.contains(place_m) for other in but], axis=0)
+        inside.append(shape.contains(place_m) & ~elsewhere)
     return float(weights[np.array(inside)].sum())
 
 
