@@ -275,6 +275,7 @@ class FakeHardwareNode(ManagedNode):
             (seed,) = values(self, "seed")
             # noise repeats with the excitation's own seed, whatever was played before
             entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
+            start_ns = self._now_ns()  # of the contact that is taken up, too, however long it takes to begin
             tip, so_far = self._touch.take_up(), None
             pressed = tip.tissue is not None and self._touch.creeps
             if pressed and not effects.nonlinearity:  # which takes the contact as fixed
@@ -283,7 +284,6 @@ class FakeHardwareNode(ManagedNode):
             noise_seed = int(entropy.generate_state(1, np.uint64)[0])
             run = BenchRun(self._bench.sensor, coupled, noise_seed, effects)
             self._silence()
-            start_ns = self._now_ns()
             ends_ns = (
                 start_ns + round(count * excitation.period_s * 1e9)
                 for count in range(1, excitation.periods + 1)
