@@ -265,7 +265,7 @@ def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen:
 
 
 def end_with_parent() -> None:
-    """Let this process, just begun, be told to end should its parent die (Linux)."""
+    """Ask Linux to end this new process when its parent dies."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 

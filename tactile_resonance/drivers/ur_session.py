@@ -191,8 +191,8 @@ class Session:
     def _limit_time(self, announced: int = 0) -> None:
         """A watchdog counts as soon as it is set: simulated time waits for the library before it expires.
 
-        It stands until so many packets have come: the robot does what it is told within the limit, however
-        late this process sends it. One that never does is ended by its owner, and time goes on.
+        Time stands until so many packets have arrived, so the robot executes the command within the limit
+        however late this process sends it. A process that never does is ended by its owner; then time goes on.
         """
         if self._clock is not None:
             self._clock.hold(0, Demand.REAL, 0)

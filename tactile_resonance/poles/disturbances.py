@@ -94,7 +94,7 @@ def chances_of(
     rounding has a level `least`. The kinds (K,) are first excited lines, then kinds of other harmonics, last
     the bins between, with noise alone. Harmonics may hold distortion: they are compared with the larger level
     of their own kind and of the noise. Other harmonics that are few of their kind are compared with the
-    excited ones, and not tested where there are none.
+    excited ones; without excited ones they are not tested.
     """
     chance = np.ones(power.size)
     levels = [level_around(power, kind, records, WINDOW) for kind in kinds]

@@ -238,7 +238,7 @@ def write_bins(
 ) -> KeptBins:
     """Write ``bins.npz`` of rows with their kinds; what is left out may be added to while these come.
 
-    Without a row what is kept stays: of a band without lines, for example.
+    Where there are no rows, as of a band without lines, the file that is there stays.
     """
     found = iter(found)
     if (first := next(found, None)) is None:

@@ -274,7 +274,7 @@ def calibration_in_air(run: RunContent, calibration: Calibration) -> Validity:
 
 
 def is_calibrated(run: RunContent) -> bool | None:
-    """Whether poles_node had a calibration when a run began, as the first mode found says; None: none was.
+    """Whether poles_node had a calibration when a run began, as the first mode says; None: there is none.
 
     Poles through it name it as their method, others in their message.
 

@@ -70,7 +70,7 @@ def test_a_run_tells_whether_its_poles_come_through_a_calibrated_sensor(
                 recording.write("/poles", POLES_TYPE, START_NS, to_cdr(poles))
                 recording.finish(run_tables.result(index))
         assert is_calibrated(run.content) is calibrated
-    if calibrated:  # it is not gone on with as if it were none
+    if calibrated:  # it is not read as a run without calibration
         assert main(["resume", str(run.path)]) == 1
         refused = "--calibration: got 'none'; accepted is the file with which the run began"
         assert refused in capsys.readouterr().err
