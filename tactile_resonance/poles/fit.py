@@ -151,30 +151,24 @@ class Linearised:
         delay_phase: FloatArray | None = None,
     ) -> Linearised:
         """At theta (s + M c,), with the delay last if its phase (K_driven,) is given; of data of one point."""
-        a, b, own = problem.sizes
-        shared, records, undriven = a + b, data.records, problem.undriven
-        gamma = theta[shared : shared + records * own].reshape(records, own)
+        a, b, _ = problem.sizes
+        last, driven = a + b + data.records * problem.sizes[2], slice(problem.undriven, None)
         inverse = 1 / (problem.denominator[:, :a] @ theta[:a] + problem.denominator[:, a])  # (K,)
-        driven = slice(undriven, None)
-        g = (problem.numerator @ theta[a:shared]) * inverse[driven]
-        by_g = np.zeros((g.size, theta.size), complex)
-        by_g[:, :a] = -(g * inverse[driven])[:, None] * problem.denominator[driven, :a]
-        by_g[:, a:shared] = inverse[driven, None] * problem.numerator
+        by_g = np.zeros((data.driven, theta.size), complex)
+        by_g[:, a : a + b] = inverse[driven, None] * problem.numerator
+        slope = np.zeros((data.records, inverse.size, theta.size), complex)
+        slope[..., a:last] = inverse[:, None] * numerator_columns(problem, data)[0]
         if delay_phase is not None:
-            turn = np.exp(-1j * delay_phase * theta[-1])
-            g, by_g = g * turn, by_g * turn[:, None]
-            by_g[:, -1] = -1j * delay_phase * g
-        transient = gamma @ problem.transient.T * inverse  # (M, K)
-        model = transient.copy()
-        u_driven = data.u_driven[0]
-        model[:, driven] += g * u_driven
-        slope = np.zeros((*model.shape, theta.size), complex)
-        slope[:, driven] = by_g * u_driven[..., None]
-        slope[..., :a] -= (transient * inverse)[..., None] * problem.denominator[:, :a]
-        for m in range(records):
-            slope[m, :, shared + m * own : shared + (m + 1) * own] = (
-                inverse[:, None] * problem.transient
-            )
+            turn = np.exp(-1j * delay_phase * theta[last])[:, None]
+            by_g[:, a : a + b] *= turn
+            slope[:, driven, a : a + b] *= turn
+        g = np.sum(by_g[:, a : a + b] * theta[a : a + b], axis=1)
+        model = slope[..., a:last] @ theta[a:last]  # (M, K)
+        by_g[:, :a] = -(g * inverse[driven])[:, None] * problem.denominator[driven, :a]
+        slope[..., :a] = -(model * inverse)[..., None] * problem.denominator[:, :a]
+        if delay_phase is not None:
+            by_g[:, last] = -1j * delay_phase * g
+            slope[:, driven, last] = by_g[:, last] * data.u_driven[0]
         variance = data.variance[0]  # (K,)
         variance[driven] = data.residual_variance(g[None])[0]
         variance_slope = np.zeros((variance.size, theta.size))
@@ -285,30 +279,49 @@ def _at_minimum(jacobian: FloatArray, residual: FloatArray, rounding: float) -> 
 
 def linear_step(problem: Problem, data: BinData, size: FloatArray) -> FloatArray:
     """(s + M c,) least squares of ``(A Y - B U - C) / |A|`` for sizes ``|A|`` (K,): of data of one point."""
-    a, b, own = problem.sizes
-    records, bins = data.records, data.undriven + data.driven
-    shared, undriven = a + b, problem.undriven
-    design = np.zeros((records, bins, shared + records * own), complex)
-    y = data.y[0][:, data.order]
-    design[..., :a] = y[..., None] * problem.denominator[:, :a]
-    design[:, undriven:, a:shared] = -data.u_driven[0][..., None] * problem.numerator
-    for m in range(records):
-        design[m, :, shared + m * own : shared + (m + 1) * own] = -problem.transient
+    a = problem.sizes[0]
+    y = data.y[0][:, data.order, None]
+    columns = numerator_columns(problem, data)[0]
+    design = np.concatenate([-y * problem.denominator[:, :a], columns], axis=-1)
     scale = 1 / (np.sqrt(data.variance[0]) * size)
-    design *= scale[..., None]
-    target = -y * problem.denominator[:, a] * scale
+    design *= scale[:, None]
+    target = y[..., 0] * problem.denominator[:, a] * scale
     return real_solution(design.reshape(-1, design.shape[-1]), target.ravel())
 
 
+def numerator_columns(problem: Problem, data: BinData) -> ComplexArray:
+    """(points, M, K, b + M c) of ``B U + C`` by each coefficient of B and of the C of each record."""
+    _, b, own = problem.sizes
+    u, records = data.u_driven, data.records
+    columns = np.zeros((len(u), records, data.order.size, b + records * own), complex)
+    columns[:, :, problem.undriven :, :b] = u[..., None] * problem.numerator
+    for m in range(records):
+        columns[:, m, :, b + m * own : b + (m + 1) * own] = problem.transient
+    return columns
+
+
 def real_solution(matrix: ComplexArray, right: ComplexArray) -> FloatArray:
-    """Real least squares solution of complex equations, whatever the scales of its unknowns."""
-    rows = np.concatenate([matrix.real, matrix.imag])
-    right = np.concatenate([right.real, right.imag])
-    column = np.linalg.norm(rows, axis=0)
+    """Real least squares solution of complex equations, whatever the scales of its unknowns.
+
+    Parameters
+    ----------
+    matrix : (..., K, n) complex
+    right : (..., K) complex
+
+    Returns
+    -------
+    (..., n) float
+        NaN where not all equations are finite.
+    """
+    rows = np.concatenate([matrix.real, matrix.imag], axis=-2)
+    right = np.concatenate([right.real, right.imag], axis=-1)[..., None]
+    finite = np.isfinite(rows).all(axis=(-2, -1)) & np.isfinite(right).all(axis=(-2, -1))
+    rows = np.where(finite[..., None, None], rows, 0.0)
+    column = np.linalg.norm(rows, axis=-2)
     column[~(column > 0)] = 1.0
-    if not np.isfinite(rows).all() or not np.isfinite(right).all():
-        return np.full(column.size, np.nan)
-    return np.linalg.lstsq(rows / column, right, rcond=None)[0] / column
+    q, r = np.linalg.qr(rows / column[..., None, :])
+    solution = (np.linalg.pinv(r, np.finfo(float).eps * rows.shape[-2]) @ (q.mT @ right))[..., 0] / column
+    return np.where(finite[..., None], solution, np.nan)
 
 
 def _best_start(problem: Problem, data: BinData, size: FloatArray | None) -> FloatArray:

@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     DenseSolution,
     Linearised,
     least_squares,
     minimise,
+    numerator_columns,
     real_solution,
 )
 from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
@@ -50,16 +51,27 @@ STARTS = 3
 TRIED_AT_ONCE = 128
 
 
+@np.errstate(all="ignore")
 def best_of_split(plan: FitPlan, data: BinData, solution: Solution) -> Solution:
     """The solution, of order 4 or more, or that from a start with its highest peak split.
 
     If that costs less by more than noise.
     """
-    start, there = _split_starts(plan, data, solution.theta)
-    rows = np.flatnonzero(there)
+    poles, split = _highest_split(plan, solution.theta[:, 0])
+    found = _coefficients(plan, data.rows(split), poles[split])
+    finite = np.isfinite(found).all(axis=1)
+    rows, found = split[finite], found[finite]
     if not rows.size:
         return solution
-    again = minimise(plan.problem, data.rows(rows), start[rows])
+    shared, own = np.split(found, [sum(plan.problem.sizes[:2])], axis=1)
+    start = np.concatenate(
+        [
+            np.broadcast_to(shared[:, None], (rows.size, data.records, shared.shape[1])),
+            own.reshape(rows.size, data.records, -1),
+        ],
+        axis=-1,
+    )
+    again = minimise(plan.problem, data.rows(rows), start)
     dof = data.records * data.order.size - sum(plan.problem.sizes) / 2
     fall = LEAST_FALL / max(dof, LEAST_FALL)
     better = again.converged & (
@@ -69,53 +81,48 @@ def best_of_split(plan: FitPlan, data: BinData, solution: Solution) -> Solution:
     return solution
 
 
-@np.errstate(all="ignore")
-def _split_starts(
-    plan: FitPlan, data: BinData, theta: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Coefficients like theta (points, M, n), and for which points there are such."""
-    shared, records = sum(plan.problem.sizes[:2]), data.records
-    model = plan.model_of(theta[:, 0])
-    start = np.full(theta.shape, np.nan)
-    poles_of_all = model.poles_rad_s()  # (points, a)
-    heights = np.abs(model.residues_and_sensitivity(poles_of_all)[0]) / np.abs(poles_of_all.real)
-    for k, of_point in enumerate(poles_of_all):
+def _highest_split(plan: FitPlan, theta: FloatArray) -> tuple[ComplexArray, IntArray]:
+    """Poles (points, a) [rad/s] of theta (points, n), the pair of the least peak at that of the highest.
+
+    And the points that have two pairs.
+    """
+    model = plan.model_of(theta)
+    poles = model.poles_rad_s()
+    heights = np.abs(model.residues_and_sensitivity(poles)[0]) / np.abs(poles.real)
+    split = []
+    for k, of_point in enumerate(poles):
         above, height = (values[of_point.imag > 0] for values in (of_point, heights[k]))
         if above.size < 2 or not np.isfinite(height).all():
             continue
         highest, least = above[np.argmax(height)], above[np.argmin(height)]
-        step = 1j * APART * abs(highest.real)
-        kept = [p for p in of_point if p.imag <= 0 or p not in (highest, least)]
-        kept = [p for p in kept if np.conj(p) not in (highest, least)]
-        pair = np.array([highest + step, highest - step])
-        poles = np.concatenate([kept, pair, pair.conj()])
-        if poles.size != of_point.size:
-            continue
-        found = _coefficients(plan, data.rows(slice(k, k + 1)), poles)
-        start[k, :, :shared], start[k, :, shared:] = found[:shared], found[shared:].reshape(records, -1)
-    return start, np.isfinite(start).all(axis=(1, 2))
+        moved = np.isin(of_point, [highest, highest.conj(), least, least.conj()])
+        if np.count_nonzero(moved) == 4:
+            pair = highest + np.array([1j, -1j]) * APART * abs(highest.real)
+            of_point[moved] = np.append(pair, pair.conj())
+            split.append(k)
+    return poles, np.array(split, int)
 
 
 def _coefficients(plan: FitPlan, data: BinData, poles: ComplexArray) -> FloatArray:
-    """(a + b + M c,) of A with given poles (a,) [rad/s], and of the B and C that fit one point best."""
+    """(points, a + b + M c) of A with given poles (points, a) [rad/s], and of the B and C that fit best."""
     roots, hessenberg = plan.variable.of_s(poles), plan.denominator_basis.hessenberg
-    a, b, own = plan.problem.sizes
-    basis = plan.problem.denominator
+    a, basis = plan.problem.sizes[0], plan.problem.denominator
     x = hessenberg[0, 0] + hessenberg[1, 0] * basis[:, 1]  # (K,) of the bins: x p_0 of the basis
-    logarithm = np.sum(np.log(x[:, None] - roots), axis=-1)  # many factors over decades overflow
-    phase = np.exp(1j * logarithm.imag)  # A / |A|
-    weighted = basis * np.exp(np.mean(logarithm.real) - logarithm.real)[:, None]
-    denominator = real_solution(weighted, phase)
-    theta = np.zeros(a + b + data.records * own)
-    theta[:a] = denominator[:-1] / denominator[-1]
-    linear = Linearised.of(plan.problem, data, theta)
-    used = np.isfinite(linear.variance)
-    weight = np.tile(1 / np.sqrt(linear.variance[used]), data.records)
-    theta[a:] = real_solution(
-        linear.slope[:, used, a:].reshape(weight.size, -1) * weight[:, None],
-        linear.error[:, used].ravel() * weight,
+    # many factors over decades overflow
+    logarithm = np.sum(np.log(x[:, None] - roots[:, None]), axis=-1)
+    phase = np.exp(1j * logarithm.imag)  # (points, K) A / |A|
+    size = logarithm.real
+    weight = np.exp(np.mean(size, axis=-1, keepdims=True) - size)
+    denominator = real_solution(weight[..., None] * basis, phase)
+    alpha = denominator / denominator[:, -1:]
+    target = data.y[..., data.order] / np.sqrt(data.variance)[:, None]  # (points, M, K)
+    scale = 1 / (np.sqrt(data.variance) * (alpha @ basis.T))  # (points, K)
+    columns = scale[:, None, :, None] * numerator_columns(plan.problem, data)
+    points, records, bins = target.shape
+    own = real_solution(
+        columns.reshape(points, records * bins, columns.shape[-1]), target.reshape(points, records * bins)
     )
-    return theta
+    return np.concatenate([alpha[:, :a], own], axis=-1)
 
 
 @np.errstate(all="ignore")
@@ -148,7 +155,7 @@ def moved_to(
     """A solution of one plan as that of another one."""
     if there is plan:
         return found
-    start = _coefficients(plan, row, _poles(there, found))
+    start = _coefficients(plan, row, _poles(there, found)[None])[0]
     return least_squares(plan.problem, row, start, None, plan.start_size)
 
 
@@ -162,7 +169,7 @@ def _minimum_from(
     """Fit that begins with these poles, of a plan with bases that suit them; None where there is none."""
     logarithm = 2 * np.sum(np.log(np.abs(plan.x[:, None] - plan.variable.of_s(poles))), axis=-1)
     there = plan.of_size(row, np.exp(logarithm - logarithm.mean()))
-    start = None if there is None else _coefficients(there, row, poles)
+    start = None if there is None else _coefficients(there, row, poles[None])[0]
     if there is None or start is None or not np.isfinite(start).all():
         return None
     solution = least_squares(there.problem, row, start, None, there.start_size)
@@ -226,6 +233,6 @@ def _falls(
 
 def _cost_from(plan: LinesPlan, row: BinData, poles: ComplexArray) -> float:
     """Cost with given poles [rad/s] and the numerator that fits best."""
-    error = Linearised.of(plan.problem, row, _coefficients(plan, row, poles)).residual
+    error = Linearised.of(plan.problem, row, _coefficients(plan, row, poles[None])[0]).residual
     cost = float(np.sum(error.real**2 + error.imag**2))
     return cost if np.isfinite(cost) else np.inf
