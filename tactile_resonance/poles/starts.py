@@ -47,8 +47,8 @@ APART = 0.7
 CHANCE = 0.3
 # Starts that are tried before a minimum is taken for the deepest, those of the least cost first.
 STARTS = 3
-# Poles at which a mode is tried in one pass: of thousands of lines more take gigabytes.
-TRIED_AT_ONCE = 128
+# Poles at which a mode is tried, and points that start anew, in one pass: of many lines more take gigabytes.
+AT_ONCE = 128
 
 
 @np.errstate(all="ignore")
@@ -58,19 +58,15 @@ def best_of_split(plan: FitPlan, data: BinData, solution: Solution) -> Solution:
     If that costs less by more than noise.
     """
     poles, split = _highest_split(plan, solution.theta[:, 0])
-    found = _coefficients(plan, data.rows(split), poles[split])
+    parts = [split[k : k + AT_ONCE] for k in range(0, split.size, AT_ONCE)]
+    if not parts:
+        return solution
+    found = np.concatenate([_coefficients(plan, data.rows(part), poles[part]) for part in parts])
     finite = np.isfinite(found).all(axis=1)
     rows, found = split[finite], found[finite]
-    if not rows.size:
-        return solution
-    shared, own = np.split(found, [sum(plan.problem.sizes[:2])], axis=1)
-    start = np.concatenate(
-        [
-            np.broadcast_to(shared[:, None], (rows.size, data.records, shared.shape[1])),
-            own.reshape(rows.size, data.records, -1),
-        ],
-        axis=-1,
-    )
+    shared = sum(plan.problem.sizes[:2])
+    of_record = np.arange(shared, found.shape[1]).reshape(data.records, -1)
+    start = np.stack([found[:, np.append(np.arange(shared), own)] for own in of_record], axis=1)
     again = minimise(plan.problem, data.rows(rows), start)
     dof = data.records * data.order.size - sum(plan.problem.sizes) / 2
     fall = LEAST_FALL / max(dof, LEAST_FALL)
@@ -199,7 +195,7 @@ def _most_lacking(
     s = np.asarray(2j * np.pi * plan.frequency_hz[used][:, None])
     weight = (row.u[0, 0][used] / np.sqrt(variance[used]))[:, None]
     # not all at once: those tried are about as many as lines
-    parts = np.array_split(tried, -(-tried.size // TRIED_AT_ONCE))
+    parts = np.array_split(tried, -(-tried.size // AT_ONCE))
     fall = np.concatenate([_falls(s, weight, basis, residual, part) for part in parts])
     k = int(np.argmax(fall))
     dof = used.sum() - solution.theta.size / 2
