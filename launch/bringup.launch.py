@@ -113,12 +113,9 @@ def _nodes(context):
     """The nodes that arguments and file ask for, and the manager that brings them up in this order."""
     given = context.launch_configurations
     stack, enclaves = given.get("ros_namespace"), given["enclaves"]
-    plan = plan_bringup(
-        given,
-        read_parameter_file(given["params_file"]),
-        make_namespace_absolute(prefix_namespace(stack, given["namespace"])) or "/",
-        may_take_priority(PRIORITY),
-    )
+    namespace = make_namespace_absolute(prefix_namespace(stack, given["namespace"])) or "/"
+    file = read_parameter_file(given["params_file"])
+    plan = plan_bringup(given, file, namespace, may_take_priority(PRIORITY))
     nodes = [
         Node(
             package=PACKAGE,
@@ -145,7 +142,7 @@ def _nodes(context):
         there = _installed("rviz2")
         nodes.append(_rviz(plan) if there else LogInfo(msg="rviz2 is not installed here: left out"))
     if given["record"] == "true":
-        nodes.append(_recorder(given["namespace"]))
+        nodes.append(_recorder(namespace.strip("/")))
     discovery = given["discovery"]
     return [
         LogInfo(
@@ -180,7 +177,7 @@ def _recorder(namespace):
     if shutil.which("ros2") is None:
         return LogInfo(msg="ros2 bag is not installed here: nothing is recorded beside the scans")
     topics = ["-e", f"^/{namespace}/.*|^/diagnostics$|^/tf_static$"] if namespace else ["-a"]
-    folder = time.strftime("session-%Y%m%d-%H%M%S") + (f"-{namespace}" if namespace else "")
+    folder = time.strftime("session-%Y%m%d-%H%M%S") + f"-{namespace}".replace("/", "-").rstrip("-")
     return ExecuteProcess(
         cmd=["ros2", "bag", "record", "-s", "mcap", "-o", folder, *topics], output="screen"
     )

@@ -2,6 +2,8 @@
 """What the nodes that the launch files start are told, by the real launch and the real rclpy."""
 
 import os
+import re
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +14,7 @@ pytest.importorskip("launch_ros", reason="launch_ros is not here: it comes with 
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 import rclpy
-from launch.actions import IncludeLaunchDescription, PushLaunchConfigurations
+from launch.actions import ExecuteProcess, IncludeLaunchDescription, PushLaunchConfigurations
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch_ros.actions import Node, PushRosNamespace
 
@@ -63,6 +65,11 @@ def start(file, *before, **given):
             process = entity.process_description
             discovery = (process.final_env or os.environ).get(DISCOVERY)
             started[entity.node_name] = Started(process.final_cmd, discovery)
+            return
+        if isinstance(entity, ExecuteProcess):
+            entity.prepare(context)
+            command = entity.process_description.final_cmd
+            started[" ".join(command[:3])] = Started(command, None)
             return
         for inner in entity.visit(context) or ():
             visit(inner)
@@ -209,6 +216,29 @@ def test_frames_have_the_namespace_before_them():
     assert heard["frame_id"] == "stack/left/tip"
     assert heard["sensor_frame"] == "stack/left/sensor"
     assert nodes["/stack/left/pole_map_node"].hears()["frame_id"] == "stack/left/table"
+
+
+@pytest.mark.parametrize(
+    ("stack", "namespace", "full"),
+    [
+        ("", "left", "left"),
+        ("", "/left", "left"),
+        ("stack", "left", "stack/left"),
+        ("stack", "", "stack"),
+    ],
+)
+def test_what_is_recorded_is_in_the_namespace_of_the_nodes(monkeypatch, stack, namespace, full):
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
+    before = (PushLaunchConfigurations(), PushRosNamespace(stack)) if stack else ()
+    nodes = start("mock.launch.py", *before, namespace=namespace, record="true")
+    assert f"/{full}/poles_node" in nodes
+    command = nodes["ros2 bag record"].command
+    topics = re.compile(command[command.index("-e") + 1])
+    heard = [f"/{full}/record", f"/{full}/pole_map/legend", "/diagnostics", "/tf_static"]
+    assert all(topics.search(topic) for topic in heard)
+    assert not any(topics.search(topic) for topic in ("/right/record", "/tf", f"/{full}_2/record"))
+    folder = command[command.index("-o") + 1]
+    assert re.fullmatch(rf"session-\d{{8}}-\d{{6}}-{full.replace('/', '-')}", folder)
 
 
 @pytest.mark.parametrize("file", ["mock", "ur"])
