@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rclpy.parameter import Parameter as RosParameter
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
@@ -67,7 +68,7 @@ PARAMETERS = (
         "YAML file with tissue_classes and their nominal_contact, a scene for example; empty: no tissue is "
         "called.",
     ),
-    Parameter(
+    Fixed(
         "unknown_level",
         0.01,
         "A pole farther from every class than this share of its members is unknown.",
@@ -176,6 +177,8 @@ class PoleMapNode(ManagedNode):
             "poles": (msg.Poles, self._on_poles, POLES),
         }[source]
         self.listen(kind, source, callback, qos, always=True)
+        self.add_post_set_parameters_callback(self._on_parameters)
+        self.resources.callback(self.remove_post_set_parameters_callback, self._on_parameters)
         TipBroadcaster(self, *values(self, "tip_frame"))
         self.serve_trigger("pole_map/clear", self._clear)
         # the frame may be known from now on only
@@ -251,6 +254,10 @@ class PoleMapNode(ManagedNode):
             self.health.error(f"poles of measurement {message.measurement_id}: {error}")
             return None
         return point
+
+    def _on_parameters(self, _: Sequence[RosParameter]) -> None:
+        """Draw anew: what is not fixed says how, and one output must not state what another does not show."""
+        self._renew()
 
     def _clear(self) -> str:
         cleared, self._grown, self._unplaced = len(self._grown), GrowingMap(), GrowingMap()

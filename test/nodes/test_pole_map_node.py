@@ -211,6 +211,25 @@ def test_what_is_shown_is_repeated_with_a_new_stamp(bench):
             assert last == first
 
 
+def test_how_it_is_drawn_may_change_and_the_legend_states_what_is_shown(bench):
+    bench.send(*[poles(k, 0.004 * (k % 3), 250.0 + k) for k in range(1, 8)])
+    shown = bench.read(MarkerArray, "pole_map/markers")
+    changes = {"ellipse_m_per_hz": 0.01, "ellipse_m_per_damping": 1.0, "ellipse_probability": 0.5}
+    for name, value in changes.items():
+        assert bench.map_node.set_parameters([rclpy.Parameter(name, value=value)])[0].successful
+    (legend,) = bench.read(MarkerArray, "pole_map/legend")
+    lines = [marker.text for marker in legend.markers]
+    assert {"ellipses: 50 %", "x: 1 mm = 0.1 Hz of f0", "y: 1 mm = 0.001 of damping ratio"} <= {*lines}
+    f0_std_hz, radius = COVARIANCE[0, 0, 0] ** 0.5, (-2 * np.log(1 - 0.5)) ** 0.5
+    half_m = radius * 0.01 * f0_std_hz
+
+    def widest_m():
+        (ellipses,) = (m for m in shown[-1].markers if m.ns == "ellipses")
+        return np.ptp([point.x for point in ellipses.points[:72]]) / 2
+
+    bench.until(lambda: widest_m() == pytest.approx(half_m, rel=1e-6))
+
+
 def test_markers_wait_for_their_frame(bench):
     bench.send(*[poles(k, 0.004 * (k % 3), 250.0 + k) for k in range(1, 8)])
     for topic in list(OUTPUTS)[1:]:
