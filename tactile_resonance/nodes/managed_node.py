@@ -303,9 +303,6 @@ class ManagedNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Set up, or report why not and stay unconfigured."""
-        if unknown := sorted(self._parameter_overrides.keys() - self._parameters.keys()):
-            text = f"parameters that {self.get_name()} does not have are given, and ignored: "
-            self.get_logger().warning(text + ", ".join(unknown))
         try:
             self.configure()
         except REFUSALS as error:

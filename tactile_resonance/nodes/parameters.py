@@ -70,7 +70,7 @@ class Fixed(Parameter):
 
 
 def declare(node: Node, parameters: Sequence[Parameter]) -> None:
-    """Declare all; what is set later is checked against the choices."""
+    """Declare all, and warn of others that are given; what is set later is checked against the choices."""
     choices = {p.name: p.choices for p in parameters if p.choices}
 
     def check(changes: Sequence) -> SetParametersResult:
@@ -84,6 +84,9 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> None:
     node.add_on_set_parameters_callback(check)
     for parameter in parameters:
         node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+    if unknown := sorted(node._parameter_overrides.keys() - node._parameters.keys()):
+        text = f"parameters that {node.get_name()} does not have are given, and ignored: "
+        node.get_logger().warning(text + ", ".join(unknown))
 
 
 def values(node: Node, *names: str) -> tuple:

@@ -12,6 +12,8 @@ import yaml
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+import rclpy
+from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from tactile_resonance.configuration import share_path
@@ -23,8 +25,10 @@ from tactile_resonance.nodes import (
     manager_node,
     pole_map_node,
     poles_node,
+    scan_goal,
     scan_node,
 )
+from tactile_resonance.nodes.parameters import declare
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 
@@ -98,19 +102,24 @@ def test_what_is_out_of_range_is_refused_with_a_reason(ros, node, name, value):
         made.destroy_node()
 
 
-def test_a_name_that_is_misspelt_is_told(monkeypatch):
+@pytest.mark.parametrize(
+    ("node", "given"),
+    [("excitation_node", "level_v:=0.2"), ("manager_node", "retry_s:=2.0"), ("scan_goal", "resume:=true")],
+)
+def test_a_name_that_is_misspelt_is_told(monkeypatch, node, given):
     """ROS passes over it without a word, and the default would hold."""
-    given = ["-p", "levl_v:=0.1", "-p", "level_v:=0.2", "-p", "use_sim_time:=false"]
-    with initialised(args=["--ros-args", *given], domain_id=free_domain_id(os.environ)):
-        node, told = excitation_node.ExcitationNode(), []
-        monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=told.append))
-        monkeypatch.setattr(node, "configure", lambda: None)
-        try:
-            node.trigger_configure()
-        finally:
-            node.destroy_node()
-    text = "parameters that excitation_node does not have are given, and ignored: levl_v"
-    assert told == [text]
+    told = []
+    monkeypatch.setattr(Node, "get_logger", lambda _: SimpleNamespace(warning=told.append))
+    arguments = ["-p", f"x{given}", "-p", given, "-p", "use_sim_time:=false"]
+    with initialised(args=["--ros-args", *arguments], domain_id=free_domain_id(os.environ)):
+        if node == "scan_goal":
+            made = rclpy.create_node(node)
+            declare(made, scan_goal.PARAMETERS)
+        else:
+            made = NODES[node]()
+        made.destroy_node()
+    name = given.partition(":")[0]
+    assert told == [f"parameters that {node} does not have are given, and ignored: x{name}"]
 
 
 def test_compressed_phases_for_one_realisation_only(ros):
