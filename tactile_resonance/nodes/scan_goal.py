@@ -93,7 +93,7 @@ def main() -> None:
             outcome = client.run()
         sys.exit(0 if outcome.ending is Ending.COMPLETE else 1)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        sys.exit(130)  # the scan goes on without it
     except (NoAnswer, ValueError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)

@@ -189,3 +189,14 @@ def test_lines_of_the_mains_are_left_out_where_the_laboratory_says_so(ros):
             excitation_node.design(node, goal, 0)
     finally:
         node.destroy_node()
+
+
+def test_scan_goal_that_is_interrupted_does_not_end_as_if_every_point_were_finished(monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(scan_goal.ScanRequest, "__enter__", interrupt)
+    monkeypatch.setattr(scan_goal.signal, "signal", lambda *_: None)
+    with pytest.raises(SystemExit) as ended:
+        scan_goal.main()
+    assert ended.value.code == 130
