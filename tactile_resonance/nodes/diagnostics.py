@@ -74,11 +74,11 @@ class Health:
 
     def _publish(self) -> None:
         now_s, state = time.monotonic(), self._node.state_name()
-        recent = now_s - self._error_s < ERROR_REMEMBERED_S
-        level, message = DiagnosticStatus.OK, state
-        if recent:
-            level = DiagnosticStatus.WARN if state == "active" else DiagnosticStatus.ERROR
+        message, levels = state, (DiagnosticStatus.OK, DiagnosticStatus.WARN)
+        if now_s - self._error_s < ERROR_REMEMBERED_S:
             message = f"{state}: {self._error}"
+            levels = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+        level = levels[state != "active"]
         values = {"state": state}
         for topic, flow in self._flows.items():
             rate_hz = len(flow.took_s) / (now_s - self._reported_s)

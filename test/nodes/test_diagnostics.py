@@ -9,10 +9,11 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticStatus
 
 from tactile_resonance.bringup import NODES
 from tactile_resonance.configuration import share_path
-from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, PERIOD_S, Health
+from tactile_resonance.nodes.diagnostics import ERROR_REMEMBERED_S, LONGEST, MEAN, PERIOD_S, Health
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
 
@@ -34,6 +35,30 @@ def test_how_long_messages_kept_the_node_is_told_once_for_each_report(monkeypatc
     assert float(first[f"record{LONGEST}"]) == pytest.approx(10.0)
     assert first["record: messages"] == second["record: messages"] == "3"
     assert f"record{MEAN}" not in second
+
+
+@pytest.mark.parametrize(
+    ("state", "with_error", "after"),
+    [("active", "WARN", "OK"), ("unconfigured", "ERROR", "WARN"), ("held: poles_node", "ERROR", "WARN")],
+)
+def test_a_node_that_is_not_active_is_not_well_however_old_its_error(
+    monkeypatch, state, with_error, after
+):
+    """A node that cannot be configured is asked again after up to 16 s, and its error is told for 10."""
+    told = []
+    with initialised(domain_id=free_domain_id(os.environ)):
+        node = rclpy.create_node("health")
+        node.state_name, node.details = lambda: state, dict
+        health = Health(node)
+        monkeypatch.setattr(health._publisher, "publish", told.append)
+        health.error("calibration: no such file")
+        health._publish()
+        health._error_s -= ERROR_REMEMBERED_S
+        health._publish()
+        node.destroy_node()
+    levels, texts = zip(*((a.status[0].level, a.status[0].message) for a in told), strict=True)
+    assert levels == (getattr(DiagnosticStatus, with_error), getattr(DiagnosticStatus, after))
+    assert texts == (f"{state}: calibration: no such file", state)
 
 
 def test_the_aggregator_puts_each_node_into_one_group():
