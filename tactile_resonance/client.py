@@ -393,6 +393,7 @@ class TactileClient:
                     if not asked.cancelled and time.monotonic() < deadline_s:
                         wanted_s = time.monotonic()
                 else:
+                    waited_for = "scan_node does not answer"
                     break
             if asked.handle is not None:
                 answer = yield from answer_to(asked.client, asked.handle, lambda: asked.heard_s)

@@ -316,6 +316,18 @@ def test_a_node_that_is_not_active_is_waited_for(stack):
     assert outcome.message == "scan_node is not active, for 1 s"
 
 
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_a_node_that_hangs_is_not_said_to_be_absent(stack, monkeypatch):
+    monkeypatch.setattr(client_module, "ASK_AGAIN_S", 0.2)
+    stack.activate()
+    stack.until(stack.client._scans.server_is_ready)
+    future = stack.client.scan(**GOAL, wait_s=0.3)
+    assert spin_until(stack.executor, future.done)
+    outcome = future.result()
+    told = outcome.ending, outcome.message
+    assert told == (Ending.REJECTED, "scan_node does not answer, for 0.3 s")
+
+
 def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     monkeypatch.setattr(goals, "GONE_S", 1.0)
     stack.activate()
