@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nodes of a scan; not started itself: mock.launch.py and ur.launch.py say on which hardware."""
 
+import difflib
 import shutil
 import time
 
@@ -19,7 +20,12 @@ from launch_ros.substitutions import FindPackageShare
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from launch import LaunchDescription
-from tactile_resonance.bringup import plan_bringup, read_parameter_file
+from tactile_resonance.bringup import (
+    ARGUMENTS,
+    FILES_OF_GOALS,
+    plan_bringup,
+    read_parameter_file,
+)
 from tactile_resonance.processes import may_take_priority
 from tactile_resonance.simulation.plant.defaults import PRIORITY
 
@@ -100,7 +106,9 @@ def generate_launch_description():
             choices=["true", "false"],
         ),
     ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
+    # also of the files that include this one
+    names = {*(a.name for a in arguments), *ARGUMENTS, *FILES_OF_GOALS, "real_time", "notes"}
+    return LaunchDescription([*arguments, OpaqueFunction(function=_nodes, args=[sorted(names)])])
 
 
 def _argument(name, description, default="", choices=None):
@@ -109,7 +117,7 @@ def _argument(name, description, default="", choices=None):
     )
 
 
-def _nodes(context):
+def _nodes(context, names):
     """The nodes that arguments and file ask for, and the manager that brings them up in this order."""
     given = context.launch_configurations
     stack, enclaves = given.get("ros_namespace"), given["enclaves"]
@@ -135,6 +143,11 @@ def _nodes(context):
     if plan.of_others:
         text = f"params_file: {', '.join(plan.of_others)} hold for none of these nodes, whose names are "
         nodes.append(LogInfo(msg=f"{text}{', '.join(plan.nodes)}, after the namespace"))
+    for name in (each.partition(":=")[0] for each in context.argv):
+        # launch passes over it without a word, and a stack has arguments of its own
+        if name not in names and (near := difflib.get_close_matches(name, names, 1, 0.8)):
+            text = f"{name}: no argument of these nodes, and ignored by them; is {near[0]} meant?"
+            nodes.append(LogInfo(msg=text))
     if not _installed("tf2_ros_py"):
         text = "tf2_ros is not installed here: no frames are broadcast, goals are in table or base"
         nodes.append(LogInfo(msg=text))

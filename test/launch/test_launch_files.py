@@ -14,7 +14,12 @@ pytest.importorskip("launch_ros", reason="launch_ros is not here: it comes with 
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 import rclpy
-from launch.actions import ExecuteProcess, IncludeLaunchDescription, PushLaunchConfigurations
+from launch.actions import (
+    ExecuteProcess,
+    IncludeLaunchDescription,
+    LogInfo,
+    PushLaunchConfigurations,
+)
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch_ros.actions import Node, PushRosNamespace
 
@@ -49,9 +54,9 @@ class Started:
             rclpy.shutdown(context=context)
 
 
-def start(file, *before, **given):
-    """The processes that a launch file starts, by the full names of the nodes."""
-    context = LaunchContext()
+def start(file, *before, argv=(), told=None, **given):
+    """The processes that a launch file starts, by the full names of the nodes; `told` takes what is logged."""
+    context = LaunchContext(argv=argv)
     source = PythonLaunchDescriptionSource(str(LAUNCH / file))
     started = {}
 
@@ -66,6 +71,8 @@ def start(file, *before, **given):
             discovery = (process.final_env or os.environ).get(DISCOVERY)
             started[entity.node_name] = Started(process.final_cmd, discovery)
             return
+        if isinstance(entity, LogInfo) and told is not None:
+            told.append("".join(part.perform(context) for part in entity.msg))
         if isinstance(entity, ExecuteProcess):
             entity.prepare(context)
             command = entity.process_description.final_cmd
@@ -165,6 +172,18 @@ def test_the_mock_by_default():
     assert scan["time_server"] == contact["time_server"] == "127.0.1.1:30021"
     assert scan["use_sim_time"]
     assert contact["force_host"] == contact["robot_host"] == "127.0.1.1"
+
+
+def test_arguments_of_the_command_line_that_are_misspelt_are_named():
+    own = {"scene": "a.yaml", "real_time": "true", "namespace": "left", "notes": "{}"}
+    of_stack = {"left_robot_ip": "127.0.1.2", "camera": "none"}
+    wrong = {"table_in_bse": "table_in_base", "namespce": "namespace", "robotip": "robot_ip"}
+    given, told = own | of_stack | dict.fromkeys(wrong, "x"), []
+    start("demo.launch.py", argv=[f"{name}:={value}" for name, value in given.items()], told=told)
+    assert [line for line in told if "meant?" in line] == [
+        f"{name}: no argument of these nodes, and ignored by them; is {right} meant?"
+        for name, right in wrong.items()
+    ]
 
 
 def test_a_robot_must_be_told_its_cell_and_its_table():
