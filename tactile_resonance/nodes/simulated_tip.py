@@ -229,7 +229,8 @@ class SimulatedTip:
     ) -> None:
         self._node, self._bench, self._scene, self.plant = node, bench, scene, plant
         self.now_ns, self.ball_radius_m = now_ns, bench.sensor.tip.radius_m
-        table, self.frame_id = values(node, "table_in_base", "frame_id")
+        names = "table_in_base", "frame_id", "base_frame"
+        table, self.frame_id, self._base_frame = values(node, *names)
         self._laid = LaidScene(scene, pose_of(table, "table_in_base"))
         self.tip, self.stays, self.stalls = BenchTip(None, 0.0, 1.0), Stays(), 0
         self._touched_ns: int | None = None  # of an ideal contact, which creeps from then on
@@ -285,7 +286,7 @@ class SimulatedTip:
                 depth_m=true["depth_m"],
             )
         x, y, z = true["tip_m"]
-        place = Contact(position_m=(x, y, z), frame_id="base", time_ns=self.now_ns())
+        place = Contact(position_m=(x, y, z), frame_id=self._base_frame, time_ns=self.now_ns())
         self._plant_ahead_s = true["time_s"] - place.time_ns * 1e-9
         self._put(Stay(place.time_ns, force_n, pose_to_message(place)), tip)
         return tip

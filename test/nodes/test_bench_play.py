@@ -42,7 +42,8 @@ PERIODS = 4
 
 @pytest.fixture
 def node():
-    with initialised(args=["--ros-args"], domain_id=free_domain_id(os.environ)):
+    arguments = ["--ros-args", "-p", "base_frame:=left_base"]
+    with initialised(args=arguments, domain_id=free_domain_id(os.environ)):
         node = FakeHardwareNode()
         node.trigger_configure()
         node.trigger_activate()
@@ -174,6 +175,13 @@ def test_an_ideal_contact_has_crept_by_as_much_as_the_age_that_is_told(node, mon
     np.testing.assert_allclose(truth.f0_hz, old, rtol=1e-5)
     assert np.abs(np.subtract(truth.f0_hz, of_1_s)).max() > 0.08
     assert truth.contact_force_n == pytest.approx(0.008)
+
+
+def test_truth_with_a_robot_is_in_the_base_of_that_robot(node):
+    node._touch.plant, truths = Held(), []
+    node._touch.truths.publish = truths.append
+    node._touch.take_up()
+    assert truths[-1].tip_pose.header.frame_id == "left_base"
 
 
 def test_contact_over_a_long_block_is_asked_for_in_as_many_parts_as_are_answered(node):
