@@ -204,7 +204,11 @@ class PoleMapNode(ManagedNode):
 
     def _on_result(self, message: msg.PointResult) -> None:
         """The latest result of a point of tissue that is not discarded replaces what was there before."""
-        result = from_message(message)
+        try:
+            result = from_message(message)
+        except ValueError as error:
+            self._leave_out(f"result of measurement {message.measurement_id}: {error}")
+            return
         if not counts(result):
             return
         self._grown.clear(result)
@@ -250,10 +254,13 @@ class PoleMapNode(ManagedNode):
                     f"frame of tip_pose: got {frame_id!r}; accepted is {self._frame_id!r}"
                 )
         except ValueError as error:
-            self._left_out += 1
-            self.health.error(f"poles of measurement {message.measurement_id}: {error}")
+            self._leave_out(f"poles of measurement {message.measurement_id}: {error}")
             return None
         return point
+
+    def _leave_out(self, reason: str) -> None:
+        self._left_out += 1
+        self.health.error(reason)
 
     def _on_parameters(self, _: Sequence[RosParameter]) -> None:
         """Draw anew: what is not fixed says how, and one output must not state what another does not show."""

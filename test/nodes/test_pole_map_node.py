@@ -230,6 +230,15 @@ def test_how_it_is_drawn_may_change_and_the_legend_states_what_is_shown(bench):
     bench.until(lambda: widest_m() == pytest.approx(half_m, rel=1e-6))
 
 
+def test_a_result_that_cannot_be_read_is_left_out_and_the_node_lives_on(scanned):
+    scanned.publisher.publish(msg.PointResult(kind="water", measurement_id=7))
+    scanned.until(lambda: scanned.map_node._left_out == 1)
+    assert scanned.map_node.health._error == "result of measurement 7: 'water' is not a valid PointKind"
+    scanned.map_node._left_out = 0
+    scanned.send(point_result(8, 0.0, 250.0))
+    assert scanned.read(PointCloud2, "pole_map")[0].width == 1
+
+
 def test_markers_wait_for_their_frame(bench):
     bench.send(*[poles(k, 0.004 * (k % 3), 250.0 + k) for k in range(1, 8)])
     for topic in list(OUTPUTS)[1:]:
