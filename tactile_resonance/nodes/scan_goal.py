@@ -30,7 +30,7 @@ PARAMETERS = (
         "",
         "Of the session, in place of the scene's: {temperature_c: 21.5, tip_wetness: wet}.",
     ),
-    Fixed("start_within_s", 120.0, "Longest wait for the nodes to come up [s].", 1.0, 3600.0),
+    Fixed("start_within_s", 120.0, "Longest wait for an active scan_node [s].", 1.0, 3600.0),
 )
 QUIET = (
     Scan.Feedback.PHASE_SURFACE,
@@ -54,15 +54,17 @@ class ScanRequest(ScanClient):
         declare(self._node, PARAMETERS)
 
     def run(self) -> ScanOutcome:
-        """Wait for the nodes, scan."""
+        """Scan once scan_node is active, which comes up last, whoever brings it up."""
         names = ("scene", "run_directory", "resume", "notes")
         goal = dict(zip(names, values(self._node, *names), strict=True))
         if goal["resume"]:
             del goal["scene"]  # that of the run
-        self.wait_until_up(values(self._node, "start_within_s")[0])
-        outcome = self.scan(**goal, on_feedback=self._tell)
+        (wait_s,) = values(self._node, "start_within_s")
+        outcome = self.scan(**goal, on_feedback=self._tell, wait_s=wait_s)
         if not outcome.points:
-            raise NoAnswer(f"{outcome.ending.value}: {outcome.message}")
+            states = sorted(self.states.items())
+            down = "; ".join(f"{name}: {state}" for name, state in states if not state.startswith("active"))
+            raise NoAnswer(f"{outcome.ending.value}: {outcome.message}{f' ({down})' if down else ''}")
         say = self._node.get_logger().info
         say(
             f"{outcome.message}: {outcome.done} of {outcome.points} points with poles, "

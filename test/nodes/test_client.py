@@ -4,6 +4,7 @@
 import json
 import math
 import os
+import threading
 import time
 from pathlib import Path
 
@@ -23,7 +24,8 @@ from tactile_resonance.msg import PointResult
 
 from tactile_resonance import client as client_module
 from tactile_resonance.client import CalibrationOutcome, Ending, ScanOutcome, TactileClient
-from tactile_resonance.nodes import goals, scan_node
+from tactile_resonance.nodes import goals, scan_goal, scan_node
+from tactile_resonance.nodes.client import NoAnswer
 from tactile_resonance.nodes.running import POINT_RESULTS, POLES, initialised
 from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
 from tactile_resonance.processes import free_domain_id
@@ -437,3 +439,21 @@ def test_a_scan_node_in_a_namespace_is_named(stack):
     assert client._scans._action_name == "left/scan"
     assert outcome.ending is Ending.REJECTED
     client.destroy()
+
+
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_scan_goal_needs_no_manager(stack, monkeypatch, tmp_path):
+    """In a stack whose supervisor brings the nodes up there is none, and nobody reports that all are active."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(stack.user.context.get_domain_id()))
+    stack.activate()
+    given = {"scene": str(tmp_path / "none.yaml"), "resume": False, "start_within_s": 20.0}
+    monkeypatch.setattr(scan_goal, "values", lambda _, *names: [given.get(name, "") for name in names])
+    spinning = threading.Thread(target=stack.own.spin)
+    spinning.start()
+    try:
+        with scan_goal.ScanRequest() as request, pytest.raises(NoAnswer) as ended:
+            request.run()
+    finally:
+        stack.own.shutdown()
+        spinning.join()
+    assert str(ended.value).startswith(f"rejected: {tmp_path / 'none.yaml'}: cannot be read")
