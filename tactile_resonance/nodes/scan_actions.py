@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, fields
@@ -23,6 +24,9 @@ from tactile_resonance.scan.table_calibration import (
     TableCalibration,
 )
 
+AT_ONCE_S = 1.0
+"""Of goals that are rejected within this, as those of two clients, each reason is told [s]."""
+OF_ANOTHER = "; of another goal at that time: "
 RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 
 
@@ -53,7 +57,9 @@ class OneGoal:
         self._node, self._around = node, around
         self.handle: ServerGoalHandle | None = None
         self.controls: Controls | None = None
-        self._asked = self._rejection = self._action = ""
+        self._action = ""
+        self._rejected: list[tuple[float, str]] = []  # when [s], and why; the newest first
+        self._told = False
         node.serve(Trigger, "scan/rejection", self._on_rejection)
 
     def act(
@@ -83,7 +89,6 @@ class OneGoal:
         found: dict[int, Any] = {}  # by the check of a goal, by its message
 
         async def refuses(message: Any) -> bool:
-            self._asked = asked = str(message)
             reason = ""
             try:
                 self._require_free()
@@ -95,8 +100,12 @@ class OneGoal:
                 self._node.get_logger().warning(f"goal rejected: {reason}")
             except Exception as error:  # else it ends the node
                 reason = self._node.health.failed("goal", error)
-            if self._asked == asked:  # no other came while this one was checked
-                self._rejection = reason
+            # who asks for the reason does not say of which goal: also those that nobody has asked for yet
+            now_s = time.monotonic()
+            others = [e for e in self._rejected if now_s - e[0] < AT_ONCE_S and e[1] != reason]
+            self._rejected = [(now_s, reason)] if reason else []
+            self._rejected += [] if self._told else others
+            self._told = False
             return bool(reason)
 
         async def serve(goal: ServerGoalHandle) -> Any:
@@ -136,14 +145,15 @@ class OneGoal:
 
     def forget_rejection(self) -> None:
         """From now on nothing was rejected."""
-        self._rejection = ""
+        self._rejected = []
 
     def _require_free(self) -> None:
         if self.handle is not None:
             raise ValueError(RUNNING)
 
     def _on_rejection(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = bool(self._rejection), self._rejection
+        self._told, reasons = True, [reason for _, reason in self._rejected]
+        response.success, response.message = bool(reasons), OF_ANOTHER.join(reasons)
         return response
 
 

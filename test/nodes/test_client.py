@@ -285,11 +285,23 @@ def test_a_goal_whose_frame_is_looked_up_keeps_no_other_waiting(stack, monkeypat
     assert "force_n: got -1.0" in outcome.message
     assert not waiting.done()
     over.set_result(None)
-    assert stack.ended(waiting).ending is Ending.REJECTED
-    # `rejection` has the reason of the latest goal
-    asking = stack.client._call("rejection")
-    stack.until(asking.done)
-    assert "force_n: got -1.0" in asking.result().message
+    outcome = stack.ended(waiting)
+    assert outcome.ending is Ending.REJECTED
+    assert "got 'camera'" in outcome.message  # not why another goal, which came later, was rejected
+    other.destroy()
+
+
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_of_two_clients_that_are_rejected_at_once_each_hears_its_own_reason_too(stack):
+    stack.activate()
+    other = TactileClient(stack.user)
+    stack.until(lambda: stack.client._scans.server_is_ready() and other._scans.server_is_ready())
+    asked = [stack.client.scan(**{**GOAL, "frame": "camera"}), other.scan(**{**GOAL, "force_n": -1.0})]
+    told = [stack.ended(future).message for future in asked]
+    assert "got 'camera'" in told[0]
+    assert "force_n: got -1.0" in told[1]
+    later = stack.ended(other.scan(**{**GOAL, "force_n": -2.0})).message
+    assert later == "force_n: got -2.0; accepted is a number above 0 (0 or NaN: the scene's)"
     other.destroy()
 
 
