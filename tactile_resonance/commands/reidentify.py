@@ -60,8 +60,7 @@ def run(options: argparse.Namespace) -> int:
         require(not several, "--output", None, "one name for the result of several runs")
         output = options.runs[0] / "reidentified"
     csv, npz = (output.with_name(output.name + ending) for ending in (".csv", ".npz"))
-    known = output.name in ("results", "mechanics", "bins")
-    taken = known or (npz.exists() and not csv.exists())  # by the heights of its surface
+    taken = output.name in ("results", "mechanics", "bins", "surface")
     of_run = taken and (output.parent / "run.json").is_file()
     require(not of_run, "--output", str(output), "a name that no file of the run itself has")
     begun_s = time.monotonic()

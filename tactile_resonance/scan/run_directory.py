@@ -3,7 +3,7 @@
 
 ::
 
-    RUN/scene.yaml                      the scene as it was given, and beside it the file of its surface, if any
+    RUN/scene.yaml surface.*            the scene as it was given, and the file of its surface, if it names one
     RUN/run.json                        plan, versions, seeds, what was skipped; written again where a scan
                                         that chooses its points appends one
     RUN/recording/point-00003-00.mcap   one file per attempt at a point (here point 3, first attempt)
@@ -138,7 +138,7 @@ class RunDirectory:
         places : sequence of ScanPoint
             Among which further points will be chosen.
         beside : Path, optional
-            File that the scene names, to be copied beside it.
+            File of the surface, which the scene names as it will be beside it: ``surface``, its ending kept.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class RunDirectory:
         (path / RECORDING).mkdir(parents=True)
         with _locked(path) as lock:
             if beside is not None:
-                write_whole(path / beside.name, beside.read_bytes())
+                write_whole(path / beside.with_stem("surface").name, beside.read_bytes())
             write_whole(path / SCENE, scene.encode())
             write_entries(path, [entry_of(path / SCENE, SCENE)])
             write_whole(path / "run.json", text)  # last: with it the run exists

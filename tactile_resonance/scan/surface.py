@@ -362,11 +362,11 @@ def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface
 
 
 def with_file_beside(fields: object, folder: Path) -> tuple[Any, Path | None]:
-    """A scene's section ``surface`` as it names its file beside the scene, and that file; None: it has none."""
+    """A scene's section ``surface`` as a run has it, its file beside the scene; and that file, None: none."""
     for form, value in fields.items() if isinstance(fields, Mapping) else ():
         if isinstance(value, Mapping) and isinstance(value.get("file"), str):
             path = folder / value["file"]
-            return {form: {**value, "file": path.name}}, path
+            return {form: {**value, "file": path.with_stem("surface").name}}, path
     return fields, None
 
 

@@ -261,7 +261,7 @@ def test_a_run_may_grow_while_its_bins_are_made(tmp_path):
 
 
 def test_what_it_refuses(runs, tmp_path, capsys):
-    none, heights = [str(tmp_path / "none")], runs[0] / "heights.npz"
+    none, heights = [str(tmp_path / "none")], runs[0] / "surface.npz"
     heights.write_bytes(b"of its surface")
     cases = {
         "cannot be read as a run": [str(tmp_path)],

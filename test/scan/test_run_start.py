@@ -117,7 +117,7 @@ def started(path, **goal):
     return plan, run
 
 
-@pytest.mark.parametrize("named", ["heights.npz", "shapes/heights.npz"])
+@pytest.mark.parametrize("named", ["surface.npz", "heights/bins.npz"])
 def test_a_run_has_the_file_of_its_surface_and_is_resumed_where_the_scene_is_gone(tmp_path, named):
     scene = tmp_path / "scenes" / "bank.yaml"
     (scene.parent / named).parent.mkdir(parents=True)
@@ -134,4 +134,5 @@ def test_a_run_has_the_file_of_its_surface_and_is_resumed_where_the_scene_is_gon
     assert again.scene.name == plan.scene.name == "bank"
     np.testing.assert_array_equal(read_run_scene(moved / "scene.yaml").surface.z_m, BANK.z_m)
     kept = (moved / "scene.yaml").read_text()
-    assert ("as always" in kept) == (named == "heights.npz")  # a scene that names its neighbour stays as it is
+    assert ("as always" in kept) == (named == "surface.npz")  # where nothing is to be changed it stays as it is
+    assert (moved / "surface.npz").exists()  # under no name that another file of a run has
