@@ -143,6 +143,7 @@ class MeasureClient:
         if result.outcome not in (Measure.Result.DONE, Measure.Result.CANCELLED):
             raise PointDisturbed(f"measurement: {result.message}", "measurement failed")
         self._wait_for_results(result, check)
+        held()  # that a contact was lost in the last block is known once its mean force has sunk
         take_poles()
         return seen[-1] if seen else None
 

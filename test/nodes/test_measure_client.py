@@ -2,6 +2,8 @@
 """All messages of a measurement are in its file, however close together they come, and in any order."""
 
 import os
+import queue
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,16 +13,18 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
+from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.measure_client import ScanRecorder
+from tactile_resonance.nodes.measure_client import MeasureClient, ScanRecorder
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, initialised
 from tactile_resonance.nodes.simulated_tip import truth_message
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import poles_from_message
+from tactile_resonance.scan.hands import PointFailed
 from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import POLES_TYPE, PointResult
 from tactile_resonance.scan.points import ScanPoint
@@ -135,3 +139,29 @@ def test_a_measurement_is_complete_with_all_of_its_excitations(nodes, tmp_path):
             assert recorder.missing(3).startswith("of 3 blocks came 2 records")
             assert recorder.poles.qsize() == 2
         recording.finish(PointResult(0, measurement_id=KEY))
+
+
+def test_a_contact_that_is_seen_lost_after_the_last_block_was_lost_in_it():
+    """The mean force sinks for 50 ms before a contact counts as lost: the measurement may be over by then."""
+    done, polls = Measure.Result(outcome=Measure.Result.DONE, blocks=1), []
+
+    def held():
+        if polls:
+            raise PointFailed("contact: contact_lost")
+
+    def follow(handle, each_poll):
+        each_poll()
+        polls.append(handle)
+        return done
+
+    client = MeasureClient.__new__(MeasureClient)
+    client._time = SimpleNamespace(simulated=False, go=lambda: None, patience_s=lambda s: s)
+    client._goals = SimpleNamespace(send=lambda *_, **__: "handle", follow=follow)
+    client.recorder = SimpleNamespace(poles=queue.SimpleQueue(), missing=lambda blocks: "")
+    client.recorder.poles.put(msg.Poles())
+    asked = Measure.Goal(), lambda *_: False, lambda: None
+    assert client._follow(*asked, lambda: None) is not None
+    client.recorder.poles.put(msg.Poles())
+    polls.clear()
+    with pytest.raises(PointFailed, match="contact_lost"):
+        client._follow(*asked, held)
