@@ -41,12 +41,13 @@ TOUCH_RETRACT_WITHIN_S = 20.0  # after a touch of a surface that is searched for
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
 OFFERED_WITHIN_S = 5.0
-# Faults of the devices, and requests of other clients, are no fault of the point: it is repeated.
+# Faults of the devices or the node, and requests of other clients, are no fault of the point: it is repeated.
 FOREIGN_CAUSES = frozenset(
     cause.value
     for cause in (
         *(Cause.FORCE_SOURCE, Cause.FORCE_STALE, Cause.FORCE_INVALID),
-        *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK, Cause.CANCELLED, Cause.BUSY),
+        *(Cause.ARM_STALE, Cause.ARM_STOPPED, Cause.ARM_LINK),
+        *(Cause.CANCELLED, Cause.BUSY, Cause.STOPPED),
     )
 )
 

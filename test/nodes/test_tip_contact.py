@@ -26,6 +26,7 @@ NOT_OF_THE_POINT = (
     "arm_link",
     "cancelled",
     "busy",
+    "stopped",
 )
 OF_THE_POINT = ("refused", "force_hard", "force_abort", "force_overload", "surface_missing", "tilt")
 
