@@ -179,7 +179,7 @@ def fit_indentation(
     Raises
     ------
     ValueError
-        If the record has no contact, or goes back before its end, or no series fits.
+        If the record has no contact, or goes back before its end, or no series fits, or best without a contact.
     """
     check_options(most_terms, thickness_m)
     means = means_of(test)
@@ -259,6 +259,7 @@ def _result(
     measured = means.force_n - zero - drift * (means.time_s - means.begin_s)
     deepest = float(ball_m[0, : means.turn + 1].max())
     peak, held = float(force[0].max()), float(force[0, means.turn])
+    require(peak > 0, "force_n", "forces that fit best without a contact", "those of tissue that stays")
     sphere = sphere_share(ball, deepest)
     layer = np.nan if np.isnan(thickness_m) else layer_share(ball, deepest, thickness_m)
     ratio = float(np.sqrt(deepest / ball.radius_m))
@@ -299,7 +300,7 @@ def _known(
     middle_s = np.sqrt(ramp_s * hold_s)
     if time_s < middle_s and time_s * np.exp(-SURE * time_std) < ramp_s:
         return Known.FASTER
-    if time_s >= middle_s and time_s * np.exp(SURE * time_std) > hold_s / SHOWN:
+    if time_s >= middle_s and SURE * time_std > np.log(hold_s / SHOWN / time_s):
         return Known.SLOWER
     return Known.UNCERTAIN if max(modulus_std, time_std) > LARGEST_STD else Known.DETERMINED
 

@@ -153,6 +153,8 @@ def test_a_way_that_goes_back_is_refused():
         (lambda test: {"force_n": np.where(test.time_s > 1, np.nan, test.force_n)}, "nan at sample"),
         (lambda test: {"time_s": test.time_s[::-1]}, "time_s: got '.* s after .* s'; accepted is asc"),
         (lambda test: {"ball": BallTip(np.inf)}, "radius_m: got inf; accepted is a number above 0"),
+        # tissue that came up under a tip that kept its place, as before a contact is given up
+        (lambda test: {"force_n": test.force_n + 0.3 * (test.time_s > 2.4)}, "without a contact.; accepted is"),
     ],
 )
 def test_what_is_no_contact_is_refused_by_field(change, message):
