@@ -342,8 +342,7 @@ class Withdrawal:
 
     def _held(self, height_m: float) -> Move:
         text = f"{-1e3 * self._smooth_n:.1f} mN pull on the tip {1e3 * height_m:.2f} mm above the surface and"
-        least_mn = -1e3 * (self._least_n or 0.0)
-        text = f"{text} grow while it is drawn back, accepted are {least_mn:.1f} mN"
+        text = f"{text} grow while it is drawn back, or the force source is not steady"
         return failed(Cause.HELD, f"{text}: free it, then ask it to retract")
 
     def _grown_n(self) -> float:

@@ -43,6 +43,19 @@ def test_hook_is_pulled_no_harder_than_accepted_and_the_tip_stays_where_it_is():
     assert made.controller.settled
 
 
+def test_a_zero_that_creeps_holds_the_tip_too_and_the_reason_leaves_that_open():
+    made = started()
+    assert made.run_until(State.HOLD)
+    faults = made.bench.cell.faults
+    made.bench.clock.on_step.append(lambda: setattr(faults, "bias_step_n", faults.bias_step_n + 1e-5))
+    made.run(1.0)
+    made.controller.retract()
+    made.run_until(State.IDLE, 4.0)
+    assert made.controller.result.cause is Cause.HELD
+    assert min(made.force_n) == 0.0  # nothing pulls
+    assert "or the force source is not steady" in made.controller.result.message
+
+
 def test_hook_that_is_asked_for_again_is_pulled_a_little_harder_each_time():
     made, _ = clinging(lambda height_m, _: 40.0 * height_m)
     for _ in range(5):
