@@ -40,6 +40,7 @@ UNKNOWN = msg.ContactState(tissue_moves_m=math.nan, zero_moved_n=math.nan)
 TOUCH_RETRACT_WITHIN_S = 20.0  # after a touch of a surface that is searched for
 RETRACT_WITHIN_S = NODE_BACK_WITHIN_S  # a contact_node that is brought back draws the tip back too
 ASK_AGAIN_S = 1.0
+NOT_ACTIVE = "is contact_node active?"
 OFFERED_WITHIN_S = 5.0
 # Faults of the devices or the node, and requests of other clients, are no fault of the point: it is repeated.
 FOREIGN_CAUSES = frozenset(
@@ -166,13 +167,12 @@ class TipContact:
         """
         if not self.touching:
             return 0.0
-        deadline = time.monotonic() + within_s
+        deadline, why = time.monotonic() + within_s, NOT_ACTIVE
         while time.monotonic() < deadline:
             self._end_if_hung()
             self._time.go()
-            if self._ask_to_retract() and self._seen_within(
-                msg.ContactState.STATE_IDLE, ASK_AGAIN_S
-            ):
+            why = self._ask_to_retract()
+            if not why and self._seen_within(msg.ContactState.STATE_IDLE, ASK_AGAIN_S):
                 self.touching, self.touched_ns = False, None
                 moved_n = self._state.zero_moved_n
                 # a refused goal made no contact: the state still describes the one before
@@ -180,9 +180,8 @@ class TipContact:
             state = self._state
             if state.cause == Cause.HELD.value and state.state == state.STATE_FAULT:
                 raise ScanEnded(f"the tip is held: {state.message}")
-        raise ScanEnded(
-            f"the tip was not drawn back within {within_s:g} s: is contact_node active?"
-        )
+            why = why or state.message or NOT_ACTIVE
+        raise ScanEnded(f"the tip was not drawn back within {within_s:g} s: {why}")
 
     def rise(self) -> None:
         """Wait until a tip that was drawn back to a low standoff is at the usual one and stands."""
@@ -190,9 +189,8 @@ class TipContact:
             return
         self._low = False
         self._time.go()
-        if self._ask_to_retract() and self._seen_within(
-            msg.ContactState.STATE_RETRACT, ASK_AGAIN_S
-        ):
+        asked = not self._ask_to_retract()
+        if asked and self._seen_within(msg.ContactState.STATE_RETRACT, ASK_AGAIN_S):
             self._seen_within(msg.ContactState.STATE_IDLE, TOUCH_RETRACT_WITHIN_S)
 
     def check(self) -> None:
@@ -237,17 +235,18 @@ class TipContact:
 
         return both
 
-    def _ask_to_retract(self) -> bool:
-        """Whether contact_node takes the request; states from before its answer do not count."""
+    def _ask_to_retract(self) -> str:
+        """Why contact_node does not take the request, empty: it does; states before its answer do not count."""
         answer = answer_of(
             self._retract, Trigger.Request(), ASK_AGAIN_S, check=self._end_if_hung
         )
         if answer is None:
-            return False
+            return NOT_ACTIVE
         self._state = UNKNOWN
-        if not answer.success:
-            time.sleep(0.05)
-        return answer.success
+        if answer.success:
+            return ""
+        time.sleep(0.05)
+        return str(answer.message)
 
     def _seen_within(self, wanted: str, seconds: float) -> bool:
         """Whether contact_node reports a state within a time; idle: that the tip is free."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a contact that ended means for the point."""
 
+from itertools import count
 from types import SimpleNamespace
 
 import pytest
@@ -64,7 +65,7 @@ def test_a_contact_is_as_old_as_its_first_touch(monkeypatch):
     assert tip.spent_s["hold_s"] == pytest.approx(0.08)
 
 
-def drawn_back(monkeypatch, seen=("approach", "hold", "retract"), **state):
+def drawn_back(monkeypatch, seen=("approach", "hold", "retract"), refused="", **state):
     """What `retract` comes to where contact_node then reports this state, after those seen."""
     tip = TipContact.__new__(TipContact)
     tip._times = StateTimes()
@@ -75,7 +76,7 @@ def drawn_back(monkeypatch, seen=("approach", "hold", "retract"), **state):
 
     def ask():
         tip._state = msg.ContactState(**state)
-        return True
+        return refused
 
     monkeypatch.setattr(tip, "_ask_to_retract", ask)
     monkeypatch.setattr("tactile_resonance.nodes.tip_contact.ASK_AGAIN_S", 0.05)
@@ -85,6 +86,13 @@ def drawn_back(monkeypatch, seen=("approach", "hold", "retract"), **state):
 def test_a_tip_that_is_held_ends_the_scan_with_the_reason(monkeypatch):
     with pytest.raises(ScanEnded, match="the tip is held: a hook pulls"):
         drawn_back(monkeypatch, state="fault", cause="held", message="a hook pulls")
+
+
+def test_a_tip_that_is_not_drawn_back_ends_the_scan_with_what_keeps_it(monkeypatch):
+    monkeypatch.setattr("time.monotonic", count(0.0, 0.3).__next__)
+    for refused, told in (("arm: protective stop", ""), ("", "tip tilted by 0.9 rad")):
+        with pytest.raises(ScanEnded, match=f"not drawn back within 1 s: {refused or told}$"):
+            drawn_back(monkeypatch, refused=refused, state="fault", message=told)
 
 
 @pytest.mark.parametrize(("moved_n", "told_n"), [(-2e-3, -2e-3), (0.0, 0.0), (float("nan"), 0.0)])
