@@ -197,11 +197,9 @@ class CellChecks:
             ranges = (*[most_n] * 3, *[most_nm] * 3)
             shares = [abs(value) / most for value, most in zip(wrench, ranges, strict=True)]
             axis = shares.index(max(shares))
-            raise ForceError(
-                ForceFault.OVERLOAD,
-                f"{self._over} samples beyond the range; {_AXES[axis]} is {wrench[axis]:.4g}, "
-                f"range {ranges[axis]:.4g}",
-            )
+            seen = f"{_AXES[axis]} is {wrench[axis]:.4g}, range {ranges[axis]:.4g}"
+            seen = seen if shares[axis] > 1 else "as the sensor reports"
+            raise ForceError(ForceFault.OVERLOAD, f"{self._over} samples beyond the range; {seen}")
         last, self._last = self._last, wrench
         if last is None:
             return over

@@ -103,6 +103,8 @@ def test_the_sensors_own_overload_bits_count():
     assert watch.check(first, overload=True) is True
     assert watch.check(second, overload=True) is True
     assert fault_of(lambda: watch.check(third, overload=True)) is ForceFault.OVERLOAD
+    with pytest.raises(ForceError, match="4 samples beyond the range; as the sensor reports"):
+        watch.check(first, overload=True)  # no figure shows it
 
 
 def test_a_change_of_sign_and_a_step_of_bias_are_jumps_a_contact_is_not():
