@@ -77,7 +77,7 @@ def command() -> NoReturn:
         status = main()
         for number in ENDING:
             signal.signal(number, signal.SIG_IGN)
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # none where the process began without
         with contextlib.suppress(OSError):  # its reader has gone
             stream.flush()
     os._exit(status)

@@ -166,3 +166,9 @@ def test_a_letter_that_the_terminal_does_not_have_is_no_error(tmp_path):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("plan of Gew\\xf6lbe\n")
+
+
+def test_a_command_that_has_no_standard_output_says_what_is_wrong_all_the_same():
+    command = f"{sys.executable} -m tactile_resonance.cli analyze nowhere.npz >&-"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "tactile_resonance: nowhere.npz: no such file or folder\n")
