@@ -272,14 +272,14 @@ def within_preparation(tissues: Iterable[Sequence[SpreadSource]]) -> FloatArray:
     Raises
     ------
     ValueError
-        If a tissue has none of both.
+        If that of positions is not determined of a tissue: repetitions at one place do not show it.
     """
     found = []
     for sources in tissues:
-        inner = [s.covariance for s in sources if s.name != LEVELS[0] and s.degrees_of_freedom]
-        accepted = "position or repetition: two points of one preparation or more"
-        require(bool(inner), "spread", [source.name for source in sources], accepted)
-        found.append(np.sum(inner, axis=0))
+        inner = {s.name: s.covariance for s in sources if s.name != LEVELS[0] and s.degrees_of_freedom}
+        accepted = "position among them: two positions of one preparation or more"
+        require("position" in inner, "spread", [*inner], accepted)
+        found.append(np.sum([*inner.values()], axis=0))
     return np.mean(found, axis=0)
 
 

@@ -213,7 +213,7 @@ def test_points_of_a_map_are_compared(runs, tmp_path, capsys):
     library.write_text(f"spread: {{gel: {{preparation: {source}}}}}")
     compare += ["--nominal", NOMINAL]
     message = called([*compare, "--library", library], capsys, status=1)
-    assert "spread: got ['preparation']; accepted is position or repetition" in message
+    assert "spread: got []; accepted is position among them: two positions of one preparation" in message
 
 
 def test_labels_of_points_places_and_what_is_left_out(tmp_path):

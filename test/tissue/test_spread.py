@@ -8,7 +8,7 @@ from tissue.reference_points import NOISE, SOURCES, drawn, joined
 
 from tactile_resonance.frf.variance_analysis import nested_means
 from tactile_resonance.tissue.classify import posteriors
-from tactile_resonance.tissue.spread import LEVELS, not_negative, spreads_of
+from tactile_resonance.tissue.spread import LEVELS, not_negative, spreads_of, within_preparation
 
 
 def test_balanced_data_give_the_classical_analysis_of_variance():
@@ -171,6 +171,13 @@ def test_refusals():
         nested_means([np.nan], [[0]], ["a"])
     with pytest.raises(ValueError, match=r"groups: got \(1, 2\)"):
         nested_means([1.0], [[0, 0]], ["a"])
+
+
+def test_repetitions_at_one_place_do_not_show_how_points_of_a_map_scatter():
+    """One place in each of six preparations, three repetitions: positions are part of the preparations."""
+    (spread,) = spreads_of(drawn(np.random.default_rng(11), [(3,)] * 6))
+    with pytest.raises(ValueError, match=r"spread: got \['repetition'\]; accepted is position among them"):
+        within_preparation([spread.sources])
 
 
 def test_nearest_covariance():
