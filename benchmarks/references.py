@@ -276,7 +276,7 @@ def run(output: Path, quick: bool) -> str:
             "",
             "## Maps without references",
             "",
-            *_map_lines(maps, within_preparation([s.sources for s in spreads_of(points)])),
+            *_map_lines(maps, *within_preparation([s.sources for s in spreads_of(points)])),
             "",
         ]
     )
@@ -377,7 +377,9 @@ def _step_table(points: ReferencePoints) -> list[str]:
     return lines
 
 
-def _map_lines(maps: tuple[list[ReferencePoints], ...], spread: FloatArray) -> list[str]:
+def _map_lines(
+    maps: tuple[list[ReferencePoints], ...], spread: FloatArray, degrees: float
+) -> list[str]:
     """What `compare` says of maps of which some points are of another casting."""
     false, found, groups, own = [], [], [], []
     for most, few in zip(*maps, strict=True):
@@ -385,10 +387,10 @@ def _map_lines(maps: tuple[list[ReferencePoints], ...], spread: FloatArray) -> l
             np.concatenate([getattr(each, name) for each in (most, few)])
             for name in ("estimate", "covariance")
         )
-        differs = differences_from_rest(x, noise, spread).differs
+        differs = differences_from_rest(x, noise, spread, degrees_of_freedom=degrees).differs
         false.append(differs[: MAP[0]].sum() / max(1, differs.sum()))
         found.append(differs[MAP[0] :].mean())
-        groups.append(len(find_clusters(x, noise, spread).mean))
+        groups.append(len(find_clusters(x, noise, spread, degrees_of_freedom=degrees).mean))
         own.append(len(find_clusters(x, noise).mean))
     return [
         f"{len(groups)} maps of {sum(MAP)} points, {MAP[1]} of them of {MAP_PERCENT:g} % gelatine and the "

@@ -274,19 +274,22 @@ def _compare(options: argparse.Namespace) -> int:
     if not rows:
         raise ValueError(f"points: {dict(left_out)}, expected one with poles or more")
     x, noise = (np.array(column) for column in list(zip(*rows, strict=True))[:2])
-    spread = np.zeros((2, 2))
+    spread, degrees = np.zeros((2, 2)), np.inf
     if options.library:
-        spread = within_preparation(read_sources(options.library).values())
+        spread, degrees = within_preparation(read_sources(options.library).values())
     elif options.spread:
         spread = np.diag(np.square(options.spread))
-    found = differences_from_rest(x, noise, spread, options.rate)
-    groups = find_clusters(x, noise, spread if spread.any() else None, options.most)
-    pairs = pairs_that_differ(x, noise, spread, options.rate) if len(x) <= MOST_PAIRED else None
+    found = differences_from_rest(x, noise, spread, options.rate, degrees)
+    given = spread if spread.any() else None
+    groups = find_clusters(x, noise, given, options.most, degrees_of_freedom=degrees)
+    paired = len(x) <= MOST_PAIRED
+    pairs = pairs_that_differ(x, noise, spread, options.rate, degrees) if paired else None
     _print_left_out(left_out)
     if nominal is None:
         print("warning: no nominal_contact: points that were pressed otherwise differ for that")
     std = np.sqrt(np.diag(spread))
-    print(f"points of one tissue scatter by {std[0]:.3g} Hz and {std[1]:.2g} beside their noise")
+    known = "" if np.isinf(degrees) else f", by {degrees:.3g} degrees of freedom"
+    print(f"points of one tissue scatter by {std[0]:.3g} Hz and {std[1]:.2g} beside their noise{known}")
     print(
         f"{int(found.differs.sum())} of {len(x)} points differ from the rest, at f0 {found.rest[0]:.3f} Hz, "
         f"damping ratio {found.rest[1]:.5f}; {100 * options.rate:g} % of them or fewer are expected not to"

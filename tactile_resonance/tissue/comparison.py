@@ -50,7 +50,11 @@ class Differences:
 
 
 def differences_from_rest(
-    estimates: npt.ArrayLike, covariances: npt.ArrayLike, spread: npt.ArrayLike, rate: float = 0.05
+    estimates: npt.ArrayLike,
+    covariances: npt.ArrayLike,
+    spread: npt.ArrayLike,
+    rate: float = 0.05,
+    degrees_of_freedom: float = np.inf,
 ) -> Differences:
     """Points that are not of the largest group of alike points.
 
@@ -65,6 +69,8 @@ def differences_from_rest(
     rate : float
         Part of the points said to differ that do not, as expected (Benjamini and Hochberg, J. R. Stat. Soc.
         B 57 (1995) 289).
+    degrees_of_freedom : float
+        Of the spread, above 1; infinite where it is known.
 
     Raises
     ------
@@ -75,7 +81,8 @@ def differences_from_rest(
     -----
     The rest is found from the point whose median distance to all others is least: those alike to it, then, in
     turn, the mean of the rest and what does not differ from it. A point is compared with the mean of the
-    others.
+    others, by Hotelling's distribution where the spread was estimated: exact where it was so behind the same
+    noise, or without any.
     """
     x, noise, beside = _checked(estimates, covariances, spread)
     total = noise + beside
@@ -92,7 +99,7 @@ def differences_from_rest(
         sums[alone] = weighted[alone]
         of_mean = np.linalg.inv(information)
         off = x - np.einsum("kij,kj->ki", of_mean, sums)
-        p = special.chdtrc(2, _squared(off, total + of_mean))
+        p = _tail(_squared(off, total + of_mean), degrees_of_freedom)
         adjusted = stats.false_discovery_control(p)
         now = adjusted > rate
         if not now.any() or np.array_equal(now, rest):
@@ -103,7 +110,11 @@ def differences_from_rest(
 
 
 def pairs_that_differ(
-    estimates: npt.ArrayLike, covariances: npt.ArrayLike, spread: npt.ArrayLike, rate: float = 0.05
+    estimates: npt.ArrayLike,
+    covariances: npt.ArrayLike,
+    spread: npt.ArrayLike,
+    rate: float = 0.05,
+    degrees_of_freedom: float = np.inf,
 ) -> BoolArray:
     """(n, n) which points differ from which, at a false discovery rate over all pairs.
 
@@ -116,7 +127,7 @@ def pairs_that_differ(
     pairs = np.zeros((len(x), len(x)), bool)
     if first.size:
         squared = _squared(x[first] - x[second], total[first] + total[second])
-        differ = stats.false_discovery_control(special.chdtrc(2, squared)) <= rate
+        differ = stats.false_discovery_control(_tail(squared, degrees_of_freedom)) <= rate
         pairs[first, second] = pairs[second, first] = differ
     return pairs
 
@@ -143,6 +154,13 @@ def _checked(
 def _squared(off: FloatArray, covariance: FloatArray) -> FloatArray:
     """(n,) squared Mahalanobis distances."""
     return np.einsum("...i,...i->...", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+
+
+def _tail(squared: FloatArray, degrees_of_freedom: float) -> FloatArray:
+    """(n,) probability that Hotelling's T^2, two dimensions, is as large or larger."""
+    nu = degrees_of_freedom
+    require(nu > 1, "degrees_of_freedom", nu, "a number above 1")
+    return np.exp(-squared / 2) if np.isinf(nu) else (1 + squared / nu) ** (-(nu - 1) / 2)
 
 
 def _alike(x: FloatArray, total: FloatArray, precision: FloatArray) -> BoolArray:
@@ -194,6 +212,7 @@ def find_clusters(
     spread: npt.ArrayLike | None = None,
     most: int = 6,
     seed: int = 1,
+    degrees_of_freedom: float = np.inf,
 ) -> Clusters:
     """The mixture of one to `most` groups with the least Bayesian information criterion.
 
@@ -211,6 +230,9 @@ def find_clusters(
         Without `spread` not more than a quarter of the points, which could not show the spreads of more.
     seed : int
         Of the starts.
+    degrees_of_freedom : float
+        Of the spread, above 1; infinite where it is known. Else all groups have the one spread that it and
+        these points show together: it counts as so many points about a known mean, behind their mean noise.
 
     Raises
     ------
@@ -228,7 +250,7 @@ def find_clusters(
     largest = n if spread is not None else max(1, n // 4)  # a mean and a covariance are five numbers
     for count in range(1, min(most, largest) + 1):
         starts = [
-            _mixture(x / unit, noise / scale, known, _seeds(x / unit, count, rng))
+            _mixture(x / unit, noise / scale, known, _seeds(x / unit, count, rng), degrees_of_freedom)
             for _ in range(_STARTS if count > 1 else 1)
         ]
         tried.append(max(starts, key=lambda mixture: mixture[-1]))
@@ -238,14 +260,15 @@ def find_clusters(
     bic = np.array([p * counted - 2 * m[-1] for p, m in zip(parameters, tried, strict=True)])
     weight, mean, covariance, probability, _ = tried[int(np.argmin(bic))]
     if len(mean) > 1:
-        probability = _by_others(x / unit, noise / scale, covariance, probability, spread is not None)
+        degrees = None if spread is None else degrees_of_freedom + n - len(mean) - 1
+        probability = _by_others(x / unit, noise / scale, covariance, probability, degrees)
     order = np.argsort(mean[:, 0])
     covariance = covariance[order] * scale
     return Clusters(weight[order], mean[order] * unit, covariance, probability[:, order], bic)
 
 
 def _mixture(
-    x: FloatArray, noise: FloatArray, known: FloatArray | None, mean: FloatArray
+    x: FloatArray, noise: FloatArray, known: FloatArray | None, mean: FloatArray, degrees: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
     """Expectation and maximisation from given means (K, 2) on, until the likelihood stands.
 
@@ -258,7 +281,8 @@ def _mixture(
     wide = np.cov(x.T, ddof=0).reshape(2, 2) / count if known is None else known
     weight = np.full(count, 1 / count)
     covariance = np.broadcast_to(wide, (count, 2, 2)).copy()
-    log_likelihood = -np.inf
+    fixed, log_likelihood = known is not None and np.isinf(degrees), -np.inf
+    mean_noise = noise.mean(axis=0)
     for _ in range(_MOST_STEPS):
         # (n, K, ...): noise and group together, and what is known of each point's own place in the group
         total = noise[:, None] + covariance
@@ -272,11 +296,15 @@ def _mixture(
         sums = density.sum(axis=1, keepdims=True)
         probability = density / sums
         before, log_likelihood = log_likelihood, float(np.sum(np.log(sums) + largest))
+        if known is not None and not fixed:  # and of what the known spread was estimated from
+            behind = covariance[0] + mean_noise
+            ratio = np.linalg.solve(behind, known + mean_noise)
+            log_likelihood += degrees / 2 * (np.linalg.slogdet(ratio)[1] - np.trace(ratio) + 2)
         if log_likelihood - before < _CONVERGED * n:
             break
         members = probability.sum(axis=0) + np.finfo(float).tiny
         weight = np.maximum(members / members.sum(), np.finfo(float).tiny)
-        if known is not None:  # the best mean is that of the points, weighted by their precisions
+        if fixed:  # the best mean is that of the points, weighted by their precisions
             weighted = probability[..., None, None] * inverse
             pull = np.einsum("nkij,nj->ki", weighted, x)
             mean = np.linalg.solve(weighted.sum(axis=0), pull[..., None])[..., 0]
@@ -288,6 +316,11 @@ def _mixture(
         about = place - mean
         scatter = about[..., :, None] * about[..., None, :] + left
         sums_of = np.einsum("nk,nkij->kij", probability, scatter)
+        if known is not None:
+            kept = np.linalg.solve(behind, covariance[0])  # of the points behind the known spread, likewise
+            its = kept.T @ (known + mean_noise) @ kept + covariance[0] - covariance[0] @ kept
+            covariance = np.broadcast_to((sums_of.sum(axis=0) + degrees * its) / (n + degrees), (count, 2, 2))
+            continue
         # with that of all groups, without which the likelihood of a group about two points has no limit
         alike = _ALIKE_POINTS * sums_of.sum(axis=0) / n
         covariance = (sums_of + alike) / (members + _ALIKE_POINTS)[:, None, None]
@@ -295,12 +328,13 @@ def _mixture(
 
 
 def _by_others(
-    x: FloatArray, noise: FloatArray, covariance: FloatArray, probability: FloatArray, known: bool
+    x: FloatArray, noise: FloatArray, covariance: FloatArray, probability: FloatArray, of_all: float | None
 ) -> FloatArray:
     """(n, K) probabilities of groups, each group as the other points (n, 2) show it.
 
-    Its mean is as uncertain as these leave it, with a wide distribution about all points before them. Where
-    the covariance was not known beforehand, deviations are Student's, with a degree of freedom for each.
+    Its mean is as uncertain as these leave it, with a wide distribution about all points before them.
+    Deviations are Student's, with the degrees of freedom `of_all` groups' one covariance; None: that of each
+    group has one for each of its points.
     A point that had a say in the mean it is compared with would be nearer to it than a new one.
     """
     total = noise[:, None] + covariance
@@ -312,8 +346,8 @@ def _by_others(
     total = total + of_mean
     squared = _squared(off, total)
     members = probability.sum(axis=0) - probability
-    degrees = members + _ALIKE_POINTS - 1
-    shape = -squared / 2 if known else -(degrees + 2) / 2 * np.log1p(squared / degrees)
+    degrees = members + _ALIKE_POINTS - 1 if of_all is None else of_all
+    shape = -squared / 2 if of_all == np.inf else -(degrees + 2) / 2 * np.log1p(squared / degrees)
     log = np.log(members + 1) + shape - np.linalg.slogdet(total)[1] / 2
     return np.asarray(special.softmax(log, axis=1))
 

@@ -266,21 +266,26 @@ def _degrees_of_freedom(
     return float(np.trace(estimated)) / known if known > 0 else float("inf")
 
 
-def within_preparation(tissues: Iterable[Sequence[SpreadSource]]) -> FloatArray:
-    """(2, 2) spread of points of one preparation: by position and repetition, mean over the tissues.
+def within_preparation(tissues: Iterable[Sequence[SpreadSource]]) -> tuple[FloatArray, float]:
+    """(2, 2) spread of points of one preparation, mean over the tissues, and its degrees of freedom.
+
+    It is that by position and repetition. Degrees of freedom are those of positions, the fewer, of tissues that
+    scatter alike; of sources that are pooled, which all have, those of one.
 
     Raises
     ------
     ValueError
         If that of positions is not determined of a tissue: repetitions at one place do not show it.
     """
-    found = []
+    found, degrees = [], {}
     for sources in tissues:
-        inner = {s.name: s.covariance for s in sources if s.name != LEVELS[0] and s.degrees_of_freedom}
+        inner = {s.name: s for s in sources if s.name != LEVELS[0] and s.degrees_of_freedom}
         accepted = "position among them: two positions of one preparation or more"
         require("position" in inner, "spread", [*inner], accepted)
-        found.append(np.sum([*inner.values()], axis=0))
-    return np.mean(found, axis=0)
+        found.append(np.sum([s.covariance for s in inner.values()], axis=0))
+        degrees[found[-1].tobytes()] = inner["position"].degrees_of_freedom
+    each = np.array([*degrees.values()])
+    return np.mean(found, axis=0), float(len(each) ** 2 / np.sum(1 / each))
 
 
 def not_negative(matrix: FloatArray, scale: FloatArray) -> FloatArray:

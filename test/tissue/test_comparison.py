@@ -7,14 +7,21 @@ import numpy as np
 import pytest
 from scipy import special, stats
 from scipy.special import logsumexp
-from tissue.reference_points import NOISE, covariance
+from tissue.reference_points import NOISE, SOURCES, covariance, drawn, joined
 
 from tactile_resonance.tissue.comparison import (
     differences_from_rest,
     find_clusters,
     pairs_that_differ,
 )
-from tactile_resonance.tissue.spread import SpreadSource, TissueSpread, percent_of, smallest_steps
+from tactile_resonance.tissue.spread import (
+    SpreadSource,
+    TissueSpread,
+    percent_of,
+    smallest_steps,
+    spreads_of,
+    within_preparation,
+)
 
 NONE = np.zeros((2, 2))
 MEAN = np.array([254.0, 0.0336])
@@ -137,6 +144,55 @@ def test_few_points_that_lie_together_by_chance_are_no_group(count, least_found)
     shifts[count // 2 :, 0] = 6 * np.sqrt(spread[0, 0])
     found = [len(find_clusters(*points(rng, shifts, spread), most=2).mean) == 2 for _ in range(40)]
     assert np.sum(found) >= stats.binom.ppf(0.001, 40, least_found)
+
+
+@pytest.mark.parametrize("pool", [False, True])
+def test_one_tissue_is_one_by_the_spread_of_few_castings_too(pool):
+    """Libraries of two tissues, four castings of two positions each: eight degrees of freedom, pooled or not.
+
+    With the spread taken for known a third of the maps would hold points, and pairs, that differ, and be split.
+    """
+    rng, runs = np.random.default_rng(10), 30
+    spread, rate = SOURCES["position"] + SOURCES["repetition"], 0.05
+    differ, pairs, split = [], [], []
+    for _ in range(runs):
+        library = joined(*(drawn(rng, [(1, 1)] * 4, tissue=name) for name in "ab"))
+        given, degrees = within_preparation([each.sources for each in spreads_of(library, pool)])
+        assert degrees == pytest.approx(8)
+        map_ = points(rng, np.zeros((16, 2)), spread)
+        differ.append(differences_from_rest(*map_, given, rate, degrees).differs.any())
+        pairs.append(pairs_that_differ(*map_, given, rate, degrees).any())
+        split.append(len(find_clusters(*map_, given, most=2, degrees_of_freedom=degrees).mean) > 1)
+    most = stats.binom.ppf(0.9999, runs, rate)
+    assert np.sum(differ) <= most
+    assert np.sum(pairs) <= most
+    assert np.sum(split) <= stats.binom.ppf(0.9999, runs, 0.13)
+
+
+def test_an_estimated_spread_counts_as_so_many_points():
+    """Of two groups far apart: between that of the map and the one given, and that given where it is known."""
+    rng, spread = np.random.default_rng(11), covariance(0.1, 1.2e-4, 0.5)
+    kind = np.repeat([0, 1], 30)
+    x, noise = points(rng, kind[:, None] * 4 * STEP, spread)
+    wide = 9 * (spread + NOISE) - NOISE
+    by = {nu: find_clusters(x, noise, wide, 2, degrees_of_freedom=nu) for nu in (30.0, 1e9, np.inf)}
+    assert [len(each.mean) for each in by.values()] == [2, 2, 2]
+    off = x - np.array([x[kind == k].mean(axis=0) for k in (0, 1)])[kind]
+    expected = (off.T @ off + 30 * (wide + NOISE)) / 90 - NOISE
+    np.testing.assert_allclose(by[30.0].covariance, [expected] * 2, rtol=0.02)
+    np.testing.assert_allclose(by[1e9].covariance, [wide] * 2, rtol=1e-5)
+    np.testing.assert_allclose(by[1e9].bic, by[np.inf].bic, rtol=1e-4)
+
+
+def test_distances_behind_an_estimated_spread_are_hotellings():
+    """Two points against each other, and a spread of as many deviations as it has degrees of freedom."""
+    rng, nu, runs = np.random.default_rng(12), 5, 1000
+    p = []
+    for _ in range(runs):
+        drawn_ = rng.multivariate_normal([0, 0], NOISE, nu + 2)
+        estimated = drawn_[:nu].T @ drawn_[:nu] / nu
+        p.append(differences_from_rest(drawn_[nu:], np.zeros((2, 2, 2)), estimated, 0.05, nu).p.min())
+    assert stats.kstest(p, "uniform").pvalue > 1e-4
 
 
 @pytest.mark.parametrize(("count", "most_wrong"), [(8, 0.008), (12, 0.008)])
