@@ -281,7 +281,7 @@ def _variance(
         ):
             # of one period or realisation: that of the mean estimate times how many are behind it
             known = [
-                getattr(f, count) * array_of(v)[c]
+                (f.periods if count == "periods" else 1) * f.realisations * array_of(v)[c]
                 for f, c in zip(frfs, common, strict=True)
                 if len(v := getattr(f, field))
             ]

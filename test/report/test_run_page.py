@@ -17,7 +17,9 @@ import pytest
 
 from benchmarks.mechanics import relaxation
 from tactile_resonance.cli import main
+from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.result import BandDistortion
+from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.report import point_details
@@ -356,6 +358,30 @@ def test_noise_over_periods_is_that_of_one_period(hostile):
     np.testing.assert_allclose(periods["y"], 10 * np.log10(one_period[inside]), atol=1e-3)
     scatter = np.var([f.g for f in frfs], axis=0, ddof=1)
     np.testing.assert_allclose(positions["y"], 10 * np.log10(scatter[inside]), atol=1e-3)
+
+
+def test_noise_over_periods_is_that_of_one_period_of_several_realisations_too(hostile):
+    """Two points of three realisations of four periods each: variance of the FRFs of single periods."""
+    rng, (folder, _), frfs, scatter = np.random.default_rng(1), hostile, [], []
+    for _ in range(2):
+        lines = np.arange(1, 200)
+        phases = np.exp(2j * np.pi * rng.uniform(size=(3, 1, 199)))
+        u = np.tile(np.fft.irfft(20 * np.pad(phases, ((0, 0), (0, 0), (1, 1)))), (1, 4, 1))
+        y = u + 0.1 * rng.standard_normal(u.shape)
+        frf = frf_of_record(Spectrum.of(u, y), lines, sample_rate_hz=400.0, method="average")
+        of = {"real": frf.g.real, "imag": frf.g.imag, "periods": frf.periods, "realisations": 3}
+        names = ("frequency_hz", "variance_noise", "variance_total")
+        frfs.append(SimpleNamespace(**of, **{name: getattr(frf, name) for name in names}))
+        used = (np.fft.rfft(y)[..., lines] / np.fft.rfft(u)[..., lines])[:, -frf.periods :]
+        scatter.append(np.var(used, axis=1, ddof=1).mean(axis=0))
+    run = read_run(folder)
+    name, _ = Counter(r.tissue_class for r in run.latest if not r.failed).most_common(1)[0]
+    two = [r.index for r in run.latest if r.tissue_class == name][:2]
+    details = {k: point_details.PointDetails(frf=frf) for k, frf in zip(two, frfs, strict=True)}
+    (figure,) = [f for f in paper_figures(run, details) if "(figure 9)" in f["title"]]
+    periods = next(t for t in figure["traces"] if t["name"].startswith("periods"))
+    level_db = 10 * np.log10(np.mean(scatter, axis=0))
+    assert np.mean(np.subtract(periods["y"], level_db)) == pytest.approx(0, abs=0.5)
 
 
 def test_large_runs_keep_few_details_and_say_so():
