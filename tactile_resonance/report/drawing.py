@@ -326,7 +326,8 @@ def draw_poles(axes: Axes, points: ReferencePoints, spreads: Sequence[TissueSpre
     for k, spread in enumerate(spreads):
         own = points.of(spread.name)
         axes.plot(*own.estimate.T, ".", ms=3, color=f"C{k}", label=spread.name)
-        _draw_ellipse(axes, spread.mean, spread.covariance + spread.noise, color=f"C{k}", lw=1)
+        measured = spread.noise + spread.force
+        _draw_ellipse(axes, spread.mean, spread.covariance + measured, color=f"C{k}", lw=1)
     axes.set(
         xlabel="f0 [Hz]", ylabel="damping ratio", title="Poles, and where 95 % are, if Gaussian"
     )
