@@ -301,7 +301,8 @@ def draw_steps(axes: Axes, steps: Sequence[SmallestStep]) -> None:
     if not steps:
         axes.text(0.5, 0.5, "no two concentrations in the names", transform=axes.transAxes, ha="center")
         return
-    names = list(steps[0].one_block)
+    ordered = ("noise", "force", "repetition", "position", "preparation")
+    names = sorted({name for step in steps for name in step.one_block}, key=ordered.index)
     for k, step in enumerate(steps):
         of = f"{step.from_percent:g} to {step.to_percent:g} %"
         x = np.arange(len(names)) + 0.12 * (k - (len(steps) - 1) / 2)
@@ -309,7 +310,7 @@ def draw_steps(axes: Axes, steps: Sequence[SmallestStep]) -> None:
             (step.one_block, "o", "one block"),
             (step.limit, "_", "limit"),
         ):
-            y = [values[name] or np.nan for name in names]
+            y = [values.get(name) or np.nan for name in names]
             axes.plot(x, y, marker, color=f"C{k}", ms=7, label=f"{of}, {which}")
     axes.axhline(PAPER_STEP_PERCENT, color="k", lw=1)
     told = f" the paper's sensor separates {PAPER_STEP_PERCENT:g} %, a surgeon's finger does not"

@@ -305,7 +305,8 @@ class SmallestStep:
     from_percent, to_percent : float
     one_block, limit : dict of str to float
         Step that is separated [%, as the concentrations], by what scatters the points: noise alone, then with
-        one source of spread after the other. After one block, and of any number of blocks, without noise.
+        one source of spread after the other that is determined. After one block, and of any number of blocks,
+        without noise.
     """
 
     first: str
@@ -329,7 +330,7 @@ def smallest_steps(
 
     The two are separated when either is called wrongly with `1 - probability`: poles 2 z standard deviations
     apart, z the normal quantile. Poles are taken as linear in the concentration between the two, and the
-    covariance as the mean of theirs. Sources that are not determined count as none.
+    covariance as the mean of theirs. Sources that are not determined of both are left out.
     """
     named = [(percent_of(spread.name), spread) for spread in spreads]
     known = [(percent, spread) for percent, spread in named if percent is not None]
@@ -351,8 +352,10 @@ def smallest_steps(
 def _steps(low: TissueSpread, high: TissueSpread, step: float, noisy: bool) -> dict[str, float]:
     """By what scatters, from inside to outside; `step` is that of one standard deviation between the two."""
     parts = {"noise": (low.block + high.block) / 2 * noisy, "force": (low.force + high.force) / 2}
+    missing = low.undetermined + high.undetermined
     for first, second in zip(low.sources[::-1], high.sources[::-1], strict=True):
-        parts[first.name] = np.nan_to_num([first.covariance, second.covariance]).mean(axis=0)
+        if first.name not in missing and (first.degrees_of_freedom or second.degrees_of_freedom):
+            parts[first.name] = np.nan_to_num([first.covariance, second.covariance]).mean(axis=0)
     total, steps, apart = np.zeros((2, 2)), {}, high.mean - low.mean
     for name, part in parts.items():
         total = total + part

@@ -268,6 +268,16 @@ def test_the_smallest_step_is_where_both_errors_are_one_in_a_hundred():
     assert (percent_of("gel 12.5% w/w"), percent_of("liver")) == (12.5, None)
 
 
+def test_a_source_that_is_not_determined_makes_no_step():
+    """One casting of the second tissue, two positions of one repetition each in all others."""
+    rng, n = np.random.default_rng(13), 4
+    low = drawn(rng, [(1, 1)] * n, tissue="gelatine 10 %")
+    high = drawn(rng, [(1, 1)] * n, mean=MEAN + STEP, tissue="gelatine 12 %")
+    for castings, outer in ((n, ["position", "preparation"]), (1, ["position"])):
+        (step,) = smallest_steps(spreads_of(joined(low, high.where(np.arange(2 * n) < 2 * castings))))
+        assert list(step.one_block) == list(step.limit) == ["noise", "force", *outer]
+
+
 def test_refusals():
     with pytest.raises(
         ValueError, match=r"covariances: got \(2, 2\); accepted is shape \(1, 2, 2\)"
