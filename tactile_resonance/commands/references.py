@@ -301,7 +301,8 @@ def _compare(options: argparse.Namespace) -> int:
         own = np.sqrt(np.diag(covariance))
         print(
             f"  {k + 1}: {counted(int(np.sum(groups.of_point == k)), 'point')}, "
-            f"f0 {mean[0]:.3f} +- {own[0]:.2g} Hz, damping ratio {mean[1]:.5f} +- {own[1]:.2g}"
+            f"f0 {mean[0]:.3f} Hz, damping ratio {mean[1]:.5f}; they scatter by {own[0]:.2g} Hz and "
+            f"{own[1]:.2g} beside their noise"
         )
     table: list[list[object]] = [[*COLUMNS]]
     for k, (name, result) in enumerate(kept):
@@ -328,11 +329,15 @@ def _check_level(level: float) -> None:
 
 
 def _read_runs(paths: Sequence[Path]) -> list[RunContent]:
-    """Runs, of which what is damaged is printed."""
+    """Runs, of which what is damaged is printed, and another sensor or band than that of the first."""
+    from tactile_resonance.report.comparison import unlike
+
     runs = [read_run(path) for path in paths]
     for run in runs:
         for problem in run.problems:
             print(f"{run.path.name}: damaged: {problem}")
+        if apart := [text for text in unlike(runs[0], run) if text.startswith(("sensor", "band"))]:
+            print(f"warning: {run.path.name} beside {runs[0].path.name}: {'; '.join(apart)}")
     return runs
 
 

@@ -216,6 +216,14 @@ def test_points_of_a_map_are_compared(runs, tmp_path, capsys):
     assert "spread: got []; accepted is position among them: two positions of one preparation" in message
 
 
+def test_runs_of_another_sensor_or_band_are_named(runs, tmp_path, capsys):
+    wide = SCENE + "sensor: {band_high_hz: 320.0}\n"
+    other = make_run(tmp_path / "wide", np.random.default_rng(9), scene=wide)
+    compare = ["compare", runs[0], other, "--nominal", NOMINAL, "--output", tmp_path / "compared"]
+    told = "warning: wide beside day 0: band 200 to 320 Hz against 200 to 300 Hz\n"
+    assert called(compare, capsys).startswith(told)
+
+
 def test_labels_of_points_places_and_what_is_left_out(tmp_path):
     rng = np.random.default_rng(2)
     run = make_run(tmp_path / "one", rng, 4)
