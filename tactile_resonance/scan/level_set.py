@@ -49,6 +49,11 @@ class LevelSet:
         """Those that are finite."""
         return tuple(level for level in (self.low, self.high) if math.isfinite(level))
 
+    @property
+    def side(self) -> str:
+        """Where it lies of its levels, for people."""
+        return "between them" if len(self.levels) == 2 else "above it" if self.high == math.inf else "below it"
+
     def depth(self, value: FloatArray) -> FloatArray:
         """(...) by how much values lie within; negative outside."""
         return np.minimum(value - self.low, self.high - value)

@@ -10,10 +10,10 @@ import pytest
 import yaml
 from scipy.spatial.distance import cdist
 
-from tactile_resonance.report.run_map import boundary_of_run
+from tactile_resonance.report.run_map import RunBoundary, boundary_of_run
 from tactile_resonance.scan.adaptive import WantedMap
 from tactile_resonance.scan.hands import Controls, Request
-from tactile_resonance.scan.level_set import boundary_of, difference_m2
+from tactile_resonance.scan.level_set import Boundary, LevelSet, boundary_of, difference_m2
 from tactile_resonance.scan.plan import make_plan, plan_against_outcome, plan_rows
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_directory import RunDirectory
@@ -268,6 +268,20 @@ def test_a_run_keeps_what_it_chose_and_its_boundary(tmp_path):
     rows = {name: (planned, came) for name, planned, came in plan_against_outcome(made, run)}
     assert rows["points"][0] == "at most 40"
     assert rows["touches chosen"][1].startswith("enough: ")
+
+
+@pytest.mark.parametrize(
+    ("level_set", "told"),
+    [
+        (LevelSet(low=256.0), "256.00 Hz after 2 touches: 4.0 mm2 above it, "),
+        (LevelSet(high=256.0), "256.00 Hz after 2 touches: 4.0 mm2 below it, "),
+        (LevelSet(255.0, 256.0), "255.00 and 256.00 Hz after 2 touches: 4.0 mm2 between them, "),
+    ],
+)
+def test_the_area_of_a_boundary_is_that_of_a_named_side(level_set, told):
+    """Around something softer the area above a level is not that of the thing."""
+    found = RunBoundary(Boundary(level_set, (), (), (), 4e-6, 1e-6, 1e-6), 2e-6, 2, "table")
+    assert found.sentences()[0].startswith(f"Boundary at {told}")
 
 
 def test_the_same_seed_gives_the_same_touches_also_after_interruptions(tmp_path):
