@@ -3,7 +3,7 @@
 
 A finished file holds three kinds of CRC-32, which say without any other file whether it is damaged: of the
 content of each chunk, of all bytes of its data section, and of its summary; 0: none. rosbags compares the first
-when it reads messages, and writes none: they are filled in when a file is complete.
+when it reads messages, and writes none.
 
 References
 ----------
@@ -14,6 +14,7 @@ https://mcap.dev/spec.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import struct
 from collections import Counter
@@ -52,15 +53,12 @@ from tactile_resonance.scan.messages import (
 BAG_VERSION: Literal[9] = 9
 # rosbags parses the QoS of every topic of every file anew, 2 ms each: few texts differ
 storage_mcap.parse_qos = cache(storage_mcap.parse_qos)  # type: ignore[assignment]
-_MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")  # op and length, before the content
+# Of a chunk's record: op, length, first and last time and size come before its checksum.
+_CHUNK_CRC = 33
+_DATA_END = b"\x0f" + struct.pack("<Q", 4)  # its checksum follows, then the summary
+_FOOTER = b"\x02" + struct.pack("<Q", 20)  # starts of the summary and of its offsets follow, then the checksum
+_END = b"\x89MCAP0\r\n"
 _CRC = struct.Struct("<I")
-_SIZE = struct.Struct("<Q")
-_FOOTER, _CHUNK, _DATA_END = 0x02, 0x06, 0x0F
-# Of a chunk's content: first and last time and size come before its checksum, then the name of the compression.
-_CHUNK_CRC = 24
-# Of the footer's: starts of summary and of its offsets come before the checksum.
-_FOOTER_CRC = 16
 _NEXT = ",\n  "  # between the entries of a list
 _FOREVER = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
@@ -120,6 +118,17 @@ class FileContent:
         return sum(topic.count for topic in self.topics if type_name in ("", topic.type_name))
 
 
+class _Storage(storage_mcap.McapWriter):
+    """Fills in the checksum of each chunk."""
+
+    def close_chunk(self) -> None:
+        place, crc = self.bio.tell() + _CHUNK_CRC, crc32(self.chunk.bio.getvalue())
+        super().close_chunk()
+        self.bio.seek(place)
+        self.bio.write(_CRC.pack(crc))
+        self.bio.seek(0, os.SEEK_END)
+
+
 class PointFileWriter:
     """Writes one file; nobody sees it before `finish`, and then nobody loses it.
 
@@ -142,7 +151,7 @@ class PointFileWriter:
         shutil.rmtree(self._folder, ignore_errors=True)
         self._folder.mkdir(parents=True)
         # rosbags' Writer around it makes metadata of YAML, ten times the rest of a file
-        self._storage = storage_mcap.McapWriter(self._folder, CompressionMode.NONE)
+        self._storage = _Storage(self._folder, CompressionMode.NONE)
         self._connections: dict[str, Connection] = {}
         self._open = True
 
@@ -382,7 +391,7 @@ def _topic(topic: TopicContent) -> dict[str, Any]:
 
 
 def write_checksums(path: Path) -> None:
-    """Fill in all checksums of a complete file without compression, as rosbags writes it.
+    """Fill in the checksums of data section and summary of a complete file.
 
     Raises
     ------
@@ -390,20 +399,18 @@ def write_checksums(path: Path) -> None:
         If it is no such file.
     """
     with path.open("r+b") as file:
-        content = bytearray(file.read())
-        for place, crc in _checksums(content):
-            _CRC.pack_into(content, place, crc)  # those that follow count it in
+        for place, crc in _checksums(file.read()):
             file.seek(place)
             file.write(_CRC.pack(crc))
 
 
 def is_checked(path: Path) -> bool:
-    """Whether a file has checksums, all of which agree with it; False: an earlier version wrote none.
+    """Whether a file has checksums, which agree with it; False: an earlier version wrote none.
 
     Raises
     ------
     ValueError
-        If one does not agree, or records do not follow each other as in a complete file.
+        If one does not agree, or the file is not complete.
     OSError
         If it cannot be read.
     """
@@ -414,44 +421,22 @@ def is_checked(path: Path) -> bool:
             return False
         if any(written != crc for written, crc in found):
             raise ValueError("its content does not agree with its checksums")
-    except ValueError as error:
+    except (ValueError, struct.error) as error:
         raise _damaged(path, error) from error
     return True
 
 
-def _checksums(content: bytes | bytearray) -> Iterator[tuple[int, int]]:
-    """Place of each checksum and what it must be, in the order in which they depend on each other."""
-    view = memoryview(content)
-    if len(view) < 2 * len(_MAGIC) or view[:8] != _MAGIC or view[-8:] != _MAGIC:
-        raise ValueError("not complete, or no MCAP file")
-    end, at, summary, op = len(view) - len(_MAGIC), len(_MAGIC), None, 0
-    while op != _FOOTER:
-        if at + _RECORD.size > end:
-            raise ValueError("its records end before its footer")
-        op, size = _RECORD.unpack_from(view, at)
-        begin, record = at, at + _RECORD.size
-        at = record + size
-        if at > end:
-            raise ValueError("a record is longer than the file")
-        if op == _CHUNK:
-            yield record + _CHUNK_CRC, crc32(_records(view[record:at]))
-        elif op == _DATA_END and size == _CRC.size and summary is None:
-            yield record, crc32(view[:begin])
-            summary = at
-    if summary is None or at != end or size != _FOOTER_CRC + _CRC.size:
+def _checksums(content: bytes) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Place of the checksum of the data section and of the summary, and what it must be."""
+    footer = len(content) - len(_FOOTER) - 20 - len(_END)
+    (summary,) = struct.unpack_from("<Q", content, max(footer, 0) + len(_FOOTER))
+    data, last = summary - 4 - len(_DATA_END), len(content) - len(_END) - 4
+    if not (
+        content.endswith(_END)
+        and content.startswith(_FOOTER, footer)
+        and content.startswith(_DATA_END, data)
+        and 0 < data < footer
+    ):
         raise ValueError("its records are not those of a complete file")
-    footer = record + _FOOTER_CRC
-    yield footer, crc32(view[summary:footer])
-
-
-def _records(chunk: memoryview) -> memoryview:
-    """Content of a chunk without compression, from that of its record."""
-    try:
-        (name,) = _CRC.unpack_from(chunk, _CHUNK_CRC + 4)
-        begin = _CHUNK_CRC + 8 + name
-        (size,) = _SIZE.unpack_from(chunk, begin)
-    except struct.error as error:
-        raise ValueError("a chunk is cut short") from error
-    if name or begin + 8 + size != len(chunk):
-        raise ValueError("a chunk is compressed or cut short")
-    return chunk[begin + 8 :]
+    view = memoryview(content)
+    return (summary - 4, crc32(view[:data])), (last, crc32(view[summary:last]))
