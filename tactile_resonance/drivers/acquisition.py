@@ -71,9 +71,9 @@ class AcquiredBlock:
 class AcquisitionDevice(Protocol):
     """One output and two inputs on one clock.
 
-    Calls come in the order plan, configure, then for each excitation arm, play, read_block (once a
-    period) and stop, for every measurement anew; stop may come at any time, and close, from any
-    thread, is the last. All raise `DeviceError`.
+    Calls come in the order plan, configure, then for each excitation play, read_block (once a period)
+    and stop, for every measurement anew; stop may come at any time, and close, from any thread, is the
+    last. All raise `DeviceError`.
     """
 
     def plan(self, excitations: Sequence[Excitation]) -> list[Excitation]:
@@ -89,12 +89,8 @@ class AcquisitionDevice(Protocol):
         """Set the sample clock; say what the device is."""
         ...
 
-    def arm(self, excitation: Excitation) -> None:
-        """Load the output and make the inputs ready; nothing moves yet."""
-        ...
-
-    def play(self) -> None:
-        """Start output and inputs together, from rest."""
+    def play(self, excitation: Excitation) -> None:
+        """Load the output, make the inputs ready, and start both together, from rest."""
         ...
 
     def read_block(self, timeout_s: float) -> AcquiredBlock:

@@ -223,7 +223,7 @@ class NiDaqDevice(AcquisitionDevice):
         self._system = load("nidaqmx.system")
         self._lock = threading.RLock()  # play and stop come from different threads when a node ends
         self._rate_hz = 0.0
-        self._armed: Excitation | None = None
+        self._playing: Excitation | None = None
         self._output: Any = None
         self._input: Any = None
         self._scales: list[CountScale] = []
@@ -274,8 +274,8 @@ class NiDaqDevice(AcquisitionDevice):
             anti_alias_filter=config.anti_alias_filter,
         )
 
-    def arm(self, excitation: Excitation) -> None:
-        """Load one period into the output and commit both tasks; nothing moves."""
+    def play(self, excitation: Excitation) -> None:
+        """Load one period, commit both tasks, start the output, which waits for the inputs, then these."""
         period = excitation.period()
         peak_v = float(np.max(np.abs(period)))
         if not peak_v <= self._config.output.max_voltage_v:
@@ -292,7 +292,7 @@ class NiDaqDevice(AcquisitionDevice):
             if self._closed:
                 raise DeviceError("nidaqmx: closed")
             self._close_tasks()
-            with self._stopping("arm"):
+            with self._stopping("play"):
                 # a reader may be late by the buffer, and two periods always fit
                 late = round(self._config.buffer_s * self._rate_hz)
                 self._input = self._make_input(max(late, 2 * period.size))
@@ -300,25 +300,16 @@ class NiDaqDevice(AcquisitionDevice):
                 commit = self._constants.TaskMode.TASK_COMMIT
                 self._input.control(commit)
                 self._output.control(commit)
-            self._armed = excitation
-            self._drive = period
-            self._index = 0
-
-    def play(self) -> None:
-        """Start the output, which waits for the trigger, then the inputs, which give it."""
-        with self._lock:
-            if self._armed is None or self._closed:
-                raise DeviceError("nidaqmx: nothing armed to play")
-            with self._stopping("play"):
                 self._maybe_on = True
                 self._output.start()
                 self._input.start()
                 self._clock = WallClock()
                 self._start_ns = self._clock.now_ns()
+            self._playing, self._drive, self._index = excitation, period, 0
 
     def read_block(self, timeout_s: float) -> AcquiredBlock:
         """The next period, whole; on any error the output is set to 0 V first."""
-        task, output, excitation = self._input, self._output, self._armed
+        task, output, excitation = self._input, self._output, self._playing
         if excitation is None or task is None or output is None:
             raise DeviceError("nidaqmx: nothing plays")
         n = excitation.samples_per_period
@@ -348,7 +339,7 @@ class NiDaqDevice(AcquisitionDevice):
     def stop(self) -> None:
         """End both tasks and set the output to 0 V."""
         with self._lock:
-            self._armed = None
+            self._playing = None
             errors = self._close_tasks()
             if self._maybe_on:
                 failed = self._zero()

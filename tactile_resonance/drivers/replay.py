@@ -55,7 +55,7 @@ class ReplayDevice:
         self._file: StoredMeasurement | None = None
         self._measurement: StoredMeasurement | None = None
         self._blocks: dict[int, Record] = {}
-        self._armed: Excitation | None = None
+        self._playing: Excitation | None = None
         self._clock, self._start_ns = WallClock(), 0
         self._index = 0
         self._stopped = threading.Event()
@@ -130,21 +130,16 @@ class ReplayDevice:
             frame_id=record.origin.frame_id if self._file is None else "",
         )
 
-    def arm(self, excitation: Excitation) -> None:
-        """Make the blocks of one realisation ready."""
-        if self._measurement is None:
+    def play(self, excitation: Excitation) -> None:
+        """Start the clock for one realisation. Only now is the measurement used up."""
+        if self._measurement is None or self._closed:
             raise DeviceError("replay: nothing planned to play")
-        self._armed = excitation
+        self._playing = excitation
         self._blocks = {
             record.block_index: record
             for record in self._measurement.records
             if record.realisation == excitation.realisation
         }
-
-    def play(self) -> None:
-        """Start the clock. Only now is the measurement used up."""
-        if self._armed is None or self._closed:
-            raise DeviceError("replay: nothing armed to play")
         self._next = self._next_after
         self._index = 0
         self._clock = WallClock()
@@ -157,7 +152,7 @@ class ReplayDevice:
 
     def read_block(self, timeout_s: float) -> AcquiredBlock:
         """The next block, when its last sample would have been taken; a gap is an error."""
-        excitation = self._armed
+        excitation = self._playing
         if excitation is None:
             raise DeviceError("replay: nothing plays")
         index = self._index
@@ -190,7 +185,7 @@ class ReplayDevice:
 
     def stop(self) -> None:
         """End what plays."""
-        self._armed = None
+        self._playing = None
         self._stopped.set()
 
     def close(self) -> None:

@@ -184,7 +184,7 @@ class BenchDevice(AcquisitionDevice):
         self._stop_client = node.create_client(Trigger, "bench/stop")
         self._blocks: queue.SimpleQueue[msg.Record | None] = queue.SimpleQueue()  # None: wake up
         self._interrupted = False
-        self._armed: Excitation | None = None
+        self._playing: Excitation | None = None
         self._next_index = 0
         self._clock: SimulatedClock | None = None
         self._start_ns = 0
@@ -208,9 +208,9 @@ class BenchDevice(AcquisitionDevice):
             anti_alias_filter="ideal",
         )
 
-    def arm(self, excitation: Excitation) -> None:
-        """Remember what to play: the bench loads nothing beforehand."""
-        self._armed = excitation
+    def play(self, excitation: Excitation) -> None:
+        """Ask the bench to play."""
+        self._playing = excitation
         self._next_index = 0
         self._interrupted = False
         if self._node.time_server and self._clock is None:
@@ -220,15 +220,8 @@ class BenchDevice(AcquisitionDevice):
                 )
             except ClockLostError as error:
                 raise DeviceError(f"device: {error}") from error
-
-    def play(self) -> None:
-        """Ask the bench to play."""
-        if self._armed is None:
-            raise DeviceError("device: nothing armed to play")
-        request = Play.Request(
-            excitation=excitation_to_message(self._armed, self._node.ros_now_ns(), self._frame_id)
-        )
-        answer = self._call(self._play_client, request)
+        message = excitation_to_message(excitation, self._node.ros_now_ns(), self._frame_id)
+        answer = self._call(self._play_client, Play.Request(excitation=message))
         if not answer.accepted:
             raise DeviceError(f"device: the bench refuses: {answer.message}")
         self._start_ns = time_from_message(answer.start)
@@ -241,10 +234,10 @@ class BenchDevice(AcquisitionDevice):
             clock.interrupt()
 
     def read_block(self, timeout_s: float) -> AcquiredBlock:
-        """Next block of what is armed; blocks of what was stopped before are passed over."""
-        if self._armed is not None and self._clock is not None:
+        """Next block of what is played; blocks of what was stopped before are passed over."""
+        if self._playing is not None and self._clock is not None:
             # time goes on to the end of the next block, and stands there until the one after
-            end_ns = self._start_ns + round((self._next_index + 1) * self._armed.period_s * 1e9)
+            end_ns = self._start_ns + round((self._next_index + 1) * self._playing.period_s * 1e9)
             try:
                 self._clock.wait_until(end_ns)
             except ClockLostError as error:
@@ -261,7 +254,7 @@ class BenchDevice(AcquisitionDevice):
             if message is None:
                 continue
             # blocks of an excitation that was stopped may still be under way
-            if self._armed and message.excitation_id == self._armed.excitation_id:
+            if self._playing and message.excitation_id == self._playing.excitation_id:
                 break
         if message.block_index != self._next_index:
             raise DeviceError(f"device: block {self._next_index + 1} lost, got {message.block_index + 1}")
@@ -273,7 +266,7 @@ class BenchDevice(AcquisitionDevice):
 
     def stop(self) -> None:
         """Silence the bench, where there is one."""
-        self._armed = None
+        self._playing = None
         if self._clock is not None:
             self._clock.close()
             self._clock = None

@@ -262,8 +262,7 @@ class ExcitationNode(ManagedNode):
             excitation_to_message(excitation, self.ros_now_ns(), self._frame_id)
         )
         try:
-            device.arm(excitation)
-            device.play()
+            device.play(excitation)
             for _ in range(excitation.periods):
                 try:
                     block = self._read_block(device, timeout_s)

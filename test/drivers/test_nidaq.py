@@ -35,19 +35,19 @@ def hardware(monkeypatch):
     return fake_nidaqmx.install(monkeypatch)
 
 
-def armed(config=CONFIG, excitation=EXCITATION):
+def playing(config=CONFIG, excitation=EXCITATION):
     device = NiDaqDevice(config)
     (planned,) = device.plan([excitation])
     device.configure(planned.sample_rate_hz)
-    device.arm(planned)
+    device.play(planned)
     return device
 
 
 def test_where_the_machines_time_is_set_blocks_keep_to_the_clock_of_the_forces(hardware, monkeypatch):
     """contact_node finds the forces of a block by its stamp, on its own relation of the clocks."""
-    device, forces = armed(), WallClock()
+    forces = WallClock()
     begun_ns = forces.now_ns()
-    device.play()
+    device = playing()
     ahead_ns = time.time_ns() - time.monotonic_ns()
     for set_s in (0.0, 3600.0, -3600.0):
         shifted_ns = ahead_ns + round(set_s * 1e9)
@@ -59,8 +59,7 @@ def test_where_the_machines_time_is_set_blocks_keep_to_the_clock_of_the_forces(h
 
 
 def test_periods_come_whole_from_rest_and_in_order(hardware):
-    device = armed()
-    device.play()
+    device = playing()
     blocks = [device.read_block(1.0) for _ in range(4)]
     device.stop()
     assert [block.index for block in blocks] == [0, 1, 2, 3]
@@ -77,10 +76,7 @@ def test_periods_come_whole_from_rest_and_in_order(hardware):
 
 
 def test_clock_trigger_and_order_of_calls(hardware):
-    device = armed()
-    assert hardware.pin_v == 0.0
-    assert "output.start" not in hardware.names()
-    device.play()
+    device = playing()
     names = hardware.names()
     assert names.index("output.start") < names.index("input.start")
     for committed in ("output.TASK_COMMIT", "input.TASK_COMMIT"):
@@ -118,8 +114,7 @@ def test_device_says_what_it_is(hardware):
 
 
 def test_a_commanded_drive_is_what_was_asked(hardware):
-    device = armed(replace(CONFIG, actuator=None))
-    device.play()
+    device = playing(replace(CONFIG, actuator=None))
     block = device.read_block(1.0)
     device.stop()
     np.testing.assert_array_equal(block.actuator.samples, EXCITATION.period())
@@ -128,8 +123,7 @@ def test_a_commanded_drive_is_what_was_asked(hardware):
 
 @pytest.mark.parametrize("ended", ["stop", "close"])
 def test_output_is_zero_and_free_after_the_end(hardware, ended):
-    device = armed()
-    device.play()
+    device = playing()
     device.read_block(1.0)
     assert hardware.pin_v != 0.0
     getattr(device, ended)()
@@ -138,24 +132,21 @@ def test_output_is_zero_and_free_after_the_end(hardware, ended):
     device.stop()  # harmless
     with pytest.raises(DeviceError, match="nothing plays"):
         device.read_block(1.0)
-    with pytest.raises(DeviceError, match="nothing armed"):
-        device.play()
 
 
-def test_a_closed_device_cannot_be_armed(hardware):
-    device = armed()
+def test_a_closed_device_plays_nothing(hardware):
+    device = playing()
     device.close()
     with pytest.raises(DeviceError, match="closed"):
-        device.arm(EXCITATION)
+        device.play(EXCITATION)
     assert hardware.open_tasks == []
 
 
 def test_realisations_follow_each_other(hardware):
-    device = armed()
+    device = playing()
     for level in (1.0, 0.5):
         excitation = replace(EXCITATION, amplitude_v=level * EXCITATION.amplitude_v)
-        device.arm(excitation)
-        device.play()
+        device.play(excitation)
         first = device.read_block(1.0)
         assert first.index == 0
         np.testing.assert_allclose(first.actuator.volts(), excitation.period(), atol=2e-4)
@@ -164,8 +155,7 @@ def test_realisations_follow_each_other(hardware):
 
 
 def test_overrun_is_named_and_the_output_zeroed(hardware):
-    device = armed()
-    device.play()
+    device = playing()
     device.read_block(1.0)
     hardware.samples_late = 500_001
     with pytest.raises(DeviceError, match="nidaqmx: block 2: overrun, blocks are lost"):
@@ -175,8 +165,7 @@ def test_overrun_is_named_and_the_output_zeroed(hardware):
 
 
 def test_an_output_that_ran_dry_is_named(hardware):
-    device = armed()
-    device.play()
+    device = playing()
     hardware.output_dies_at = 700
     device.read_block(1.0)
     with pytest.raises(DeviceError, match="block 2: DAC conversion attempted") as raised:
@@ -188,9 +177,9 @@ def test_an_output_that_ran_dry_is_named(hardware):
 @pytest.mark.parametrize(
     ("call", "step"),
     [
-        ("output.trigger", "arm"),
-        ("output.write", "arm"),
-        ("input.TASK_COMMIT", "arm"),
+        ("output.trigger", "play"),
+        ("output.write", "play"),
+        ("input.TASK_COMMIT", "play"),
         ("output.start", "play"),
         ("input.start", "play"),
         ("input.read", "read"),
@@ -200,8 +189,7 @@ def test_any_failure_leaves_zero_volts_and_no_task(hardware, call, step):
     device = NiDaqDevice(CONFIG)
     device.configure(RATE_HZ)
     hardware.fail_on[call] = fake_nidaqmx.DaqError("It broke.", -50000)
-    steps = {"arm": lambda: device.arm(EXCITATION), "play": device.play}
-    steps["read"] = lambda: device.read_block(1.0)
+    steps = {"play": lambda: device.play(EXCITATION), "read": lambda: device.read_block(1.0)}
     for name, run in steps.items():
         if name == step:
             with pytest.raises(DeviceError, match=r"nidaqmx: .*It broke. Status Code: -50000$"):
@@ -214,8 +202,7 @@ def test_any_failure_leaves_zero_volts_and_no_task(hardware, call, step):
 
 
 def test_an_output_that_cannot_be_zeroed_is_shouted_and_tried_again(hardware):
-    device = armed()
-    device.play()
+    device = playing()
     hardware.fail_on["output.write"] = fake_nidaqmx.DaqError("Device removed.", -50405)
     hardware.samples_late = 10**9
     with pytest.raises(DeviceError, match="overrun.*THE OUTPUT MAY NOT BE AT ZERO.*removed"):
@@ -248,17 +235,16 @@ def test_what_the_device_cannot_do_is_refused(hardware):
     device.configure(RATE_HZ)
     loud = replace(EXCITATION, amplitude_v=10 * EXCITATION.amplitude_v)
     with pytest.raises(DeviceError, match="output.max_voltage_v is 5 V"):
-        device.arm(loud)
+        device.play(loud)
     with pytest.raises(DeviceError, match="sample_rate_hz: 1000, configured was 50000"):
-        device.arm(replace(EXCITATION, sample_rate_hz=1000.0))
+        device.play(replace(EXCITATION, sample_rate_hz=1000.0))
     assert "output.start" not in hardware.names()
 
 
 def test_saturation_is_flagged(hardware):
     peak_v = np.max(np.abs(EXCITATION.period()))
     hardware.range_v = 0.9 * peak_v
-    device = armed()
-    device.play()
+    device = playing()
     block = device.read_block(1.0)
     device.stop()
     assert block.actuator.saturated
@@ -291,8 +277,7 @@ def test_counts_where_the_converter_is_straight_else_volts():
 
 def test_wide_converters_are_read_as_such(hardware):
     hardware.raw_bits, hardware.coefficients = 32, [0.0, 5e-9]
-    device = armed()
-    device.play()
+    device = playing()
     block = device.read_block(1.0)
     device.stop()
     np.testing.assert_allclose(block.actuator.volts(), EXCITATION.period(), atol=2.6e-9)

@@ -33,8 +33,7 @@ def play(device, request=ASKED):
     info = device.configure(planned[0].sample_rate_hz)
     blocks = []
     for excitation in planned:
-        device.arm(excitation)
-        device.play()
+        device.play(excitation)
         blocks.append([device.read_block(1.0) for _ in range(excitation.periods)])
         device.stop()
     return planned, info, blocks
@@ -136,8 +135,7 @@ def test_a_gap_is_an_error_where_it_comes(tmp_path):
     (folder / "record-00000-0000002.npz").unlink()
     device = ReplayDevice(tmp_path, speed=0)
     first, _ = device.plan(ASKED)
-    device.arm(first)
-    device.play()
+    device.play(first)
     assert [device.read_block(1.0).index for _ in range(2)] == [0, 1]
     with pytest.raises(DeviceError, match="block 3 of realisation 1 is missing"):
         device.read_block(1.0)
@@ -151,28 +149,25 @@ def test_calls_out_of_order_are_refused(tmp_path):
     device = ReplayDevice(tmp_path)
     for call in (
         lambda: device.configure(1.0),
-        lambda: device.arm(ASKED[0]),
-        device.play,
+        lambda: device.play(ASKED[0]),
         lambda: device.read_block(1.0),
     ):
         with pytest.raises(DeviceError, match="nothing"):
             call()
     device.stop()  # harmless
-    device.arm(device.plan(ASKED)[0])
+    (first, *_) = device.plan(ASKED)
     device.close()
-    with pytest.raises(DeviceError, match="nothing armed"):
-        device.play()
+    with pytest.raises(DeviceError, match="nothing planned"):
+        device.play(first)
 
 
 def test_speed_paces_the_blocks(tmp_path):
     stores.write(RecordStore(tmp_path), 7)  # periods of 40 ms
     fast = ReplayDevice(tmp_path, speed=0)
-    fast.arm(fast.plan(ASKED)[0])
-    fast.play()
+    fast.play(fast.plan(ASKED)[0])
     assert [fast.read_block(0.0).index for _ in range(3)] == [0, 1, 2]
     slow = ReplayDevice(tmp_path, speed=1e-3)  # the first block is due after 40 s
-    slow.arm(slow.plan(ASKED)[0])
-    slow.play()
+    slow.play(slow.plan(ASKED)[0])
     with pytest.raises(DeviceError, match="no block within 0.01 s"):
         slow.read_block(0.01)
     with pytest.raises(ValueError, match="speed: -1"):
@@ -229,8 +224,7 @@ def test_where_the_machines_time_is_set_blocks_of_a_file_keep_to_the_monotonic_c
     np.savez(tmp_path / "m.npz", u=u, y=u, sample_rate_hz=1000.0)
     device = ReplayDevice(tmp_path / "m.npz", speed=0)
     (planned,) = device.plan(ASKED)
-    device.arm(planned)
-    device.play()
+    device.play(planned)
     ahead_ns = time.time_ns() - time.monotonic_ns() + 3600 * 10**9
     monkeypatch.setattr(time, "time_ns", lambda: time.monotonic_ns() + ahead_ns)
     for n in range(3):

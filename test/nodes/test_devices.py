@@ -90,7 +90,7 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
         ("configure", DeviceError, Measure.Result.NOT_READY),
         ("configure", ValueError, Measure.Result.REFUSED),
         ("", DeviceError, Measure.Result.REFUSED),
-        ("arm", DeviceError, Measure.Result.FAILED),
+        ("play", DeviceError, Measure.Result.FAILED),
     ],
 )
 def test_what_an_error_means_is_a_matter_of_how_far_the_measurement_came(

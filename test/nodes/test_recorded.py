@@ -138,8 +138,7 @@ def test_a_replay_plays_the_run_again_bit_by_bit(run):
         (planned,) = device.plan([design_multisine(label="asked for")])
         assert planned.measurement_id == key
         device.configure(planned.sample_rate_hz)
-        device.arm(planned)
-        device.play()
+        device.play(planned)
         blocks = [device.read_block(1.0) for _ in range(planned.periods)]
         device.stop()
         assert same(planned.phase_rad, excitation.phase_rad)
