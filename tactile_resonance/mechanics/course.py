@@ -268,20 +268,6 @@ class SeriesProblem:
         found = [solution for x in starts if (solution := self._from(terms, x)) is not None]
         return min(found, key=lambda solution: solution.chi_square, default=None)
 
-    def shortened(self, longer: SeriesSolution, known: SeriesSolution) -> SeriesSolution:
-        """Best of a solution and of those from one with a term more, two made one or one left out."""
-        n, x = longer.terms, longer.x
-        moduli, times = x[1 : 1 + n], x[1 + n : 1 + 2 * n]
-        j, least = int(np.argmin(np.diff(times))), int(np.argmin(moduli))
-        both = np.logaddexp(moduli[j], moduli[j + 1])
-        share = np.exp(moduli[j] - both)
-        merged = np.delete(moduli, j), np.delete(times, j)
-        merged[0][j], merged[1][j] = both, share * times[j] + (1 - share) * times[j + 1]
-        left = np.delete(moduli, least), np.delete(times, least)
-        starts = [np.concatenate([x[:1], *one, x[-4:]]) for one in (merged, left)]
-        found = [solution for s in starts if (solution := self._from(n - 1, s)) is not None]
-        return min([known, *found], key=lambda solution: solution.chi_square)
-
     def _starts_after(self, fewer: SeriesSolution) -> list[FloatArray]:
         """The solution with one term less, and a small term beside it, or one of its own cut in two."""
         n, x = fewer.terms, fewer.x

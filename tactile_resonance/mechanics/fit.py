@@ -193,8 +193,6 @@ def fit_indentation(
         if len(solved) > 2 and _enough(solved[-3:], means.time_s.size) == 0:
             break
     require(bool(solved), "test", test.label, "a record that a Prony series fits")
-    for n in reversed(range(len(solved) - 1)):  # a series may show the way to a shorter one
-        solved[n] = problem.shortened(solved[n + 1], solved[n])
     chosen = _enough(solved[:most_terms], means.time_s.size)
     further = solved[chosen + 1] if chosen + 1 < len(solved) else None
     return _result(problem, solved[chosen], further, solved[:most_terms], thickness_m)
