@@ -126,7 +126,7 @@ class RunBoundary:
         lines = [
             f"Boundary at {levels} Hz after {counted(self.touches, 'touch', 'touches')}: "
             f"{1e6 * found.area_m2:.1f} mm2 {found.level_set.side}, "
-            f"{1e6 * found.wrong_area_m2:.2g} mm2 expected on its wrong side, "
+            f"{1e6 * found.wrong_area_m2:.3g} mm2 expected on its wrong side, "
             f"{1e6 * self.wanted_m2:.3g} mm2 asked for{'' if self.met else ': not met'}."
         ]
         if not math.isnan(self.off_m2):

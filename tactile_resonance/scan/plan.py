@@ -339,7 +339,7 @@ def _found(asked: Adaptive, results: Sequence[PointResult]) -> str:
     if isinstance(asked.wanted, WantedMap):
         _, std_hz = surface.predict(asked.raster.xy_m[asked.raster.within])
         return f"{met}: +- {std_hz.max():.2g} Hz at most, {counted(len(results), 'touch', 'touches')}"
-    return f"{met}: {1e6 * loss:.2g} mm2, {counted(len(results), 'touch', 'touches')}"
+    return f"{met}: {1e6 * loss:.3g} mm2, {counted(len(results), 'touch', 'touches')}"
 
 
 def _period(plan: Plan) -> str:

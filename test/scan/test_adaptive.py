@@ -280,8 +280,9 @@ def test_a_run_keeps_what_it_chose_and_its_boundary(tmp_path):
 )
 def test_the_area_of_a_boundary_is_that_of_a_named_side(level_set, told):
     """Around something softer the area above a level is not that of the thing."""
-    found = RunBoundary(Boundary(level_set, (), (), (), 4e-6, 1e-6, 1e-6), 2e-6, 2, "table")
-    assert found.sentences()[0].startswith(f"Boundary at {told}")
+    found = RunBoundary(Boundary(level_set, (), (), (), 4e-6, 1e-6, 15.2e-6), 15e-6, 2, "table")
+    asked = "15.2 mm2 expected on its wrong side, 15 mm2 asked for: not met."
+    assert found.sentences() == [f"Boundary at {told}{asked}"]
 
 
 def test_the_same_seed_gives_the_same_touches_also_after_interruptions(tmp_path):
