@@ -22,7 +22,7 @@ from tactile_resonance.poles.lines import (
     lines_of_spectra,
 )
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, are_smooth, systematic_of
-from tactile_resonance.poles.noise_level import KINDS, ROUNDED, student_variance
+from tactile_resonance.poles.noise_level import KINDS, ROUNDED, not_counted, student_variance
 from tactile_resonance.poles.result import Poles, PolesBatch
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
 
@@ -233,13 +233,15 @@ def _judged(
     of_fit, fit = plan.fit(lines.data)
     residual = fit.residual[:, 0]
     plain = 0.5 * fit.marginal[:, 0]  # where the variance of each line is the one weighted with
+    cost, expected = fit.cost, known.expected_cost(parameters)
+    chance = known.chance(cost, parameters)
+    suspect = level_known & (chance < MODEL_ERROR_PROBABILITY)
     wider = known.information_correction * lines.noise_at_modes(of_fit, fit)
+    wider = wider * not_counted(np.where(suspect, np.nan, chance), cost / expected)
     covariance = plain * wider[:, None, None]
     total = covariance if lines.total_known else None
     if lines.noise is not None:
         covariance = of_fit.propagated(fit, lines.data, lines.noise)
-    cost, expected = fit.cost, known.expected_cost(parameters)
-    suspect = level_known & known.contradicts(cost, parameters, MODEL_ERROR_PROBABILITY)
     suspect |= are_smooth(residual, parameters)
     asked = fit.converged & (suspect | (used.size == 1)) & (not plan.structure.delay)
     asked &= (known.kind < 2) | (known.dof >= FEWEST_OF_A_LINE)

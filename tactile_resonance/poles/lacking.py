@@ -27,6 +27,7 @@ from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.likelihood import Solution
 from tactile_resonance.poles.model import PolynomialBasis
 from tactile_resonance.poles.model_error import are_smooth
+from tactile_resonance.poles.noise_level import DOUBT
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
 
 # How often each of the two tests finds something lacking in a model that is complete.
 FALSE_ALARM = 2e-4
-# How often two residual terms more are doubted to be noise in such a model.
-DOUBT = 0.05
 # Of a fit: with fewer the residuals show no level of the noise.
 FEWEST_DOF = 3
 # Of variances that are from each line, or piece of the band, alone: with fewer the weights follow the noise.

@@ -31,7 +31,7 @@ from tactile_resonance.poles.noise_level import (
     Pieces,
     at_modes,
     chance_of_pieces,
-    is_rare,
+    not_counted,
     student_variance,
 )
 from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
@@ -66,7 +66,7 @@ def level_of(
     cost, expected, suspect, noise
         See `judgement.Judged`.
     correction : (batch,) float
-        Factor of the covariance for a level that is not known exactly.
+        Factor of the covariance for a level that is not known exactly, and for what it does not count.
     """
     batch, _, n = solution.theta.shape
     lines, others = plan.excited_at.size, plan.others_at.size
@@ -82,14 +82,16 @@ def level_of(
     level = solution.part_cost[:, 0] / dof_o
     cost = solution.part_cost[:, 1] / level
     expected = dof_e * dof_o / (dof_o - 1)
-    suspect = is_rare(cost / dof_e, dof_e, dof_o, MODEL_ERROR_PROBABILITY)
+    chance = special.fdtrc(2 * dof_e, 2 * dof_o, cost / dof_e)
     correction = student_variance(dof)
     if by_piece.any():
         expected = np.where(by_piece, expected * BINS_PER_BAND / (BINS_PER_BAND - 1), expected)
-        chance = chance_of_pieces(cost / expected, dof_e, BINS_PER_BAND * lines / others, BINS_PER_BAND)
-        suspect = np.where(by_piece, chance < MODEL_ERROR_PROBABILITY, suspect)
+        of_pieces = chance_of_pieces(cost / expected, dof_e, BINS_PER_BAND * lines / others, BINS_PER_BAND)
+        chance = np.where(by_piece, of_pieces, chance)
         correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
+    suspect = chance < MODEL_ERROR_PROBABILITY
     scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
+    correction = correction * not_counted(np.where(suspect, np.nan, chance), cost / expected * level / scale)
     return scale, cost, expected, suspect, noise * level[:, None], correction
 
 

@@ -34,6 +34,8 @@ KINDS = ("flat", "sloped", "per line")
 # What chance makes more often says nothing; the rarer it is, the more it counts. A test that is passed or not
 # would pass differences of the size of the noise, and ellipses would hold 80 to 90 %.
 CHANCE = 0.5
+# Chance below which what speaks against a fit, not surely, counts in its covariance: in one sound fit in 20.
+DOUBT = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,18 +124,17 @@ class VarianceModel:
         """(batch,) expectation of ``sum |e|^2 / s^2`` with noise alone; NaN where it has none."""
         return (self.lines - parameters / 2) * student_variance(self.pooled_dof)
 
-    def contradicts(self, cost: FloatArray, parameters: int, probability: float) -> BoolArray:
-        """(batch,) whether noise alone exceeds a cost more rarely; False where that cannot be determined."""
+    def chance(self, cost: FloatArray, parameters: int) -> FloatArray:
+        """(batch,) how often noise alone exceeds a cost; NaN where that cannot be determined."""
         free = np.maximum(self.lines - parameters / 2, 0.5)
-        rare = is_rare(cost / free, free, self.pooled_dof, probability)
+        chance = special.fdtrc(2 * free, 2 * self.pooled_dof, cost / free)
         by_line = self.kind == 2
         if by_line.any():
-            rare[by_line] = False
+            chance[by_line] = np.nan
             if self.dof > 2:
-                expected = free * self.dof / (self.dof - 1)
-                chance = chance_of_pieces(cost / expected, free, 1, self.dof)
-                rare |= by_line & (chance < probability)
-        return rare
+                ratio = cost / self.expected_cost(parameters)
+                chance = np.where(by_line, chance_of_pieces(ratio, free, 1, self.dof), chance)
+        return np.asarray(chance)
 
 
 @np.errstate(invalid="ignore")
@@ -168,20 +169,14 @@ def chance_of_pieces(
     return np.asarray(special.chdtrc(2 / spread, 2 / spread * ratio))
 
 
-def is_rare(
-    ratio: FloatArray, dof: FloatArray, other_dof: FloatArray, probability: float
-) -> BoolArray:
-    """(batch,) whether chance makes a ratio of two variances more rarely than a probability below a hundredth.
+def not_counted(chance: FloatArray, ratio: FloatArray) -> FloatArray:
+    """(batch,) factor of covariances for noise whose variance on lines is `ratio` times what is counted of it.
 
-    `dof` and `other_dof` (batch,) are the complex degrees of freedom of the first and of the second.
+    Steps of a converter repeat in every period, so that they stand on excited lines alone. What chance makes
+    more rarely than `DOUBT` counts, the rarer the more. 1 where chance is NaN.
     """
-    # within two deviations of 1 chance is not below that
-    rare = np.asarray(ratio > 1 + 2 * np.sqrt(1 / dof + 1 / other_dof))
-    rows = np.flatnonzero(rare)
-    if rows.size:  # others need no special function
-        chance = special.fdtrc(2 * dof[rows], 2 * other_dof[rows], ratio[rows])
-        rare[rows] = chance < probability
-    return rare
+    more = np.maximum(1 - chance / DOUBT, 0) * np.maximum(ratio - 1, 0)
+    return np.where(np.isfinite(more), 1 + more, 1.0)
 
 
 @np.errstate(divide="ignore", invalid="ignore")

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""On which bins the poles of records rest, against derivatives of the fit by differences."""
+"""Which noise counts: on the bins that poles rest on, and on excited lines alone."""
 
 import numpy as np
 import pytest
+from scipy import special
 
+from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles import levels
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Linearised, minimise
+from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.joint import PoleEstimator
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -14,7 +17,7 @@ RECORDS, PERIODS, SAMPLES, RATE_HZ = 2, 3, 200, 1000.0
 
 
 def test_bins_count_as_their_noise_moves_poles(monkeypatch):
-    """Of the variance on driven bins the part that is noise."""
+    """Of the variance on driven bins the part that is noise; against derivatives of the fit by differences."""
     rng, lines = np.random.default_rng(3), np.arange(20, 80)
     plan = PoleEstimator(RATE_HZ, SAMPLES, PERIODS, lines, (100.0, 395.0), ModelStructure(2, 2))
     s, w0 = 2j * np.pi * plan.frequency_hz, 2 * np.pi * 250
@@ -50,3 +53,29 @@ def test_bins_count_as_their_noise_moves_poles(monkeypatch):
     share /= share.sum(axis=-1, keepdims=True)
     own_bins = np.where(np.arange(first + driven) < first, 1.0, first / driven)
     assert seen["dof"][0, 0] == pytest.approx(RECORDS / (share**2 / own_bins).sum(axis=-1), rel=1e-5)
+
+
+@pytest.mark.parametrize("estimator", ["record", "frf"])
+def test_noise_that_repeats_in_every_period_counts(estimator):
+    """As of a converter with coarse steps: on excited lines alone, and too little to be a model error."""
+    rng, points, lines = np.random.default_rng(11), 1000, np.arange(80, 121)
+    variance, more = 1e-6, 0.55  # of the mean over periods, and what repeats, of that
+    structure, band_hz = ModelStructure(2, 3), (200.0, 300.0)
+    plan = PoleEstimator(5000.0, 2000, 4, lines, band_hz, structure)
+    s, w0 = 2j * np.pi * plan.frequency_hz, 2 * np.pi * 250
+    u = plan.driven * np.exp(2j * np.pi * rng.random((points, s.size)))
+    y = 0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2) * u
+    noise = np.sqrt(variance / 2 * (1 + more * plan.driven))
+    y = y + noise * rng.standard_normal((*y.shape, 2)).view(complex)[..., 0]
+    found = plan.from_bins(u[:, None], y[:, None])
+    if estimator == "frf":
+        at = plan.excited_at
+        known = np.full((points, at.size), variance)
+        frf = FRF(plan.frequency_hz[at], y[:, at] / u[:, at], variance_noise=known, noise_dof=3)
+        found = identify_batch(frf, band_hz, structure)
+    fine = found.status_code == 0
+    error = np.stack([found.f0_hz[:, 0] - 250, found.damping_ratio[:, 0] - 0.02], axis=-1)[fine]
+    distance2 = error[:, None] @ np.linalg.solve(found.covariance[fine, 0], error[..., None])
+    inside = distance2 < special.chdtri(2, 0.05)
+    assert fine.mean() > 0.6
+    assert 0.915 < inside.mean() < 0.97
