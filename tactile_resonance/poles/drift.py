@@ -249,6 +249,8 @@ def _linearised(
     data = BinData.of(y[None, None], u[None, None], plan.order, others)
     known, *_ = with_noise(plan, data, theta[None, None])
     alike = known.covariance_yu.size > 0  # noise on both channels
+    # what the input explains leaves its own noise, with the shape of the mode as a drift
+    flat &= alike or known.y is data.y
     if not (flat and alike):
         data = known  # what came through the input is no drift
     at = Linearised.of(plan.problem, data, theta)
