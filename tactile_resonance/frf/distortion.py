@@ -298,6 +298,8 @@ def distortion_in_band(
 ) -> BandDistortion:
     """Levels of even and odd distortion at the detection lines of one band.
 
+    Of single periods those of the output are NaN: a transient stands there like distortion.
+
     Parameters
     ----------
     spectra : PeriodicSpectra
@@ -310,7 +312,7 @@ def distortion_in_band(
     found = nonlinear_distortion(spectra, excited_harmonics, sample_rate_hz=sample_rate_hz)
     values: dict[str, Any] = {}
     for name, lines in (("even", found.even), ("odd", found.odd)):
-        values[f"{name}_db"] = float(lines.rms_level_db)
+        values[f"{name}_db"] = np.nan if spectra.covariance is None else float(lines.rms_level_db)
         values[f"{name}_noise_db"] = float(lines.rms_noise_level_db)
         values[f"{name}_above_noise"] = bool(lines.above_noise)
         values[f"input_{name}_db"] = float(lines.rms_input_level_db)

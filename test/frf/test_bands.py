@@ -123,6 +123,17 @@ def test_even_distortion_is_told_in_each_band(square):
     assert all_of(MeasurementFrf(1), excitation()).distortion == ()
 
 
+def test_a_transient_of_a_single_period_is_not_called_distortion():
+    """From rest the linear system has -17 dB at the lines that are left out."""
+    made = excitation(band_hz=(10.0, 2000.0), grid=Grid.ODD_RANDOM)
+    u, y = measured(made)
+    frf = MeasurementFrf(1).add(Record(Channel(u[0]), Channel(y[0]), RATE_HZ, N), made)
+    for found in frf.distortion:
+        assert np.isnan([found.even_db, found.odd_db, found.even_noise_db]).all()
+        assert found.input_even_db < -60
+        assert not found.even_above_noise
+
+
 def test_bands_are_stored_with_their_excitation(tmp_path):
     for made in (excitation(), excitation(bands=())):
         write_stored(tmp_path / "e.npz", made)
