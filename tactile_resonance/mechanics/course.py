@@ -401,6 +401,18 @@ class SeriesProblem:
         noise = level * (np.eye(count) + square * walk)
         return inverse @ noise @ inverse.T, float(np.sqrt(level * square))
 
+    def moved_by_slower(self, solution: SeriesSolution, time_s: float) -> float:
+        """By how much a term more, of that time constant, may move ln Einf: as it fits, and its deviation."""
+        n, x, added = solution.terms, solution.x, 1e-3 * self._scale_pa
+        more = np.insert(x, [1 + n, 1 + 2 * n], np.log([added, time_s]))
+        base, inverse = self.residuals(x), solution.inverse
+        by_modulus = (self.residuals(more) - base) / added
+        own = by_modulus - solution.jacobian @ (inverse @ by_modulus)
+        square = float(own @ own)
+        level = max(1.0, solution.chi_square / max(1, self.means.time_s.size - x.size))
+        modulus = np.hypot(own @ base / square, np.sqrt(level / square))
+        return float(modulus * (inverse @ by_modulus)[0])
+
     def jacobian(self, x: FloatArray) -> FloatArray:
         """(residuals, unknowns), by differences of one batch."""
         steps = np.full(x.size, STEP)

@@ -10,7 +10,8 @@ A term acts on the record only between the duration of the ramp and that of the 
 ramp shows one number, of slower ones the hold shows a part. All faster terms together are fitted as one of
 an eighth of the ramp, and slower ones as they come, for the others would be biased without them; they are
 declared `not determined`. What is left to chance in the number of terms is in the deviations: the step of
-each constant to the series with one term more.
+each constant to the series with one term more, and of Einf what a term so slow that the hold does not show it
+may hide.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from tactile_resonance.mechanics.prony import Prony
 MOST_TERMS = 4
 SHOWN, SURE = 2.5, 2.0
 """A hold shows a term where it lasts so many of its time constants: with less, one term passes for two. By so
-many deviations."""
+many deviations. A term of so many holds may hide in Einf."""
 LARGEST_STD = 0.3
 """Relative deviation beyond which a constant is not determined."""
 SIGNIFICANT = 0.05
@@ -240,13 +241,14 @@ def _result(
         beyond = Prony(float(einf), *np.split(np.array(rest), 2))
     values = np.exp(best.x[: 2 * n + 1])
     hold_s = max(means.hold_s, means.ramp_s)
+    std[0] = np.hypot(std[0], problem.moved_by_slower(best, SHOWN * hold_s))
     terms = []
     for j in range(n):
         modulus, time = values[1 + j], values[1 + n + j]
         stds = std[1 + j], std[1 + n + j]
         known = _known(time, *stds, means.ramp_s, hold_s)
         terms.append(Term(float(modulus), float(time), float(stds[0]), float(stds[1]), known))
-    equilibrium = Known.UNCERTAIN if std[0] > LARGEST_STD else Known.DETERMINED
+    equilibrium = Known.DETERMINED if std[0] <= LARGEST_STD else Known.UNCERTAIN
     if any(
         t.known is Known.SLOWER or (t.known is Known.UNCERTAIN and t.time_s > hold_s / 4)
         for t in terms

@@ -37,6 +37,16 @@ def test_constants_of_one_and_two_terms_lie_within_their_deviations(stiffness_n_
     assert binom.cdf((pooled < 1.96).sum(), pooled.size, 0.93) > 1e-3
 
 
+def test_a_term_that_the_hold_does_not_show_is_in_the_deviation_of_einf():
+    """Einf was called determined 9 deviations off."""
+    truth, found = Prony(1.5e3, np.array([1e3, 800.0]), np.array([1.0, 60.0])), []
+    for seed in range(6):
+        test = relaxation(truth, np.random.default_rng(seed), hold_s=5.0, noise_n=1e-3)
+        fit = fit_indentation(test, most_terms=2)
+        found += [error for name, error in errors_of(fit, truth) if name == "Einf"]
+    assert np.max(np.abs(found), initial=0.0) < 4
+
+
 def walked(test, walk_n_per_sqrt_s, seed):
     """The same with a zero of the force that walks at random."""
     steps = np.sqrt(np.diff(test.time_s, prepend=test.time_s[0]))
