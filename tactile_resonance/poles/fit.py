@@ -44,83 +44,8 @@ def refit_failed(problem: Problem, solution: Solution, data: BinData) -> None:
     """Fit the points that did not converge again, at full precision, in place."""
     for k in np.flatnonzero(~solution.converged & solution.plain):
         found = least_squares(problem, data.rows(slice(k, k + 1)))
-        if found.converged:
-            solution.put(np.array([k]), found.solution(problem))
-
-
-@dataclass(frozen=True, eq=False)
-class DenseSolution:
-    """Coefficients of one point at full precision.
-
-    Attributes
-    ----------
-    theta : (s + M c,) float
-        [A without its last, B, C of each record], and the delay over its unit if asked for.
-    jacobian : (M, K, 2, n) float
-        Of real and imaginary parts of the weighted residuals.
-    residual : (M, K) complex
-        Weighted.
-    turned : (M, K_driven) complex
-        Those of driven bins, turned by the phase of the input.
-    converged : bool
-    """
-
-    theta: FloatArray
-    jacobian: FloatArray
-    residual: ComplexArray
-    turned: ComplexArray
-    converged: bool
-
-    @property
-    def cost(self) -> float:
-        """Sum of the squared residuals."""
-        return float(np.sum(self.residual.real**2 + self.residual.imag**2))
-
-    def solution(self, problem: Problem) -> Solution:
-        """The same of a batch of one; a delay stays last in theta."""
-        inverse, condition = self.covariance()
-        records, undriven = len(self.jacobian), problem.undriven
-        a, b, own = problem.sizes
-        shared, n = a + b, self.theta.size - (records - 1) * own
-        theta, normal = np.empty((1, records, n)), np.empty((1, records, 2, n, n))
-        marginal, leverage = np.empty((1, records, n, n)), np.zeros((1, 2))
-        for m in range(records):
-            of_record = np.arange(shared + m * own, shared + (m + 1) * own)
-            columns = np.r_[:shared, of_record, shared + records * own : self.theta.size]
-            theta[0, m], marginal[0, m] = self.theta[columns], inverse[np.ix_(columns, columns)]
-            for part, here in enumerate((slice(0, undriven), slice(undriven, None))):
-                rows = self.jacobian[m, here][..., columns].reshape(-1, n)
-                normal[0, m, part] = rows.T @ rows
-            leverage[0] += np.sum(marginal[0, m] * normal[0, m], axis=(-2, -1))
-        power = np.sum(self.residual.real**2 + self.residual.imag**2, axis=0)
-        part_cost = np.array([[power[:undriven].sum(), power[undriven:].sum()]])
-        return Solution(
-            theta,
-            part_cost.sum(axis=1),
-            part_cost,
-            self.turned[None],
-            np.array([self.converged]),
-            normal if records > 1 else normal[:0],
-            marginal,
-            np.array([condition]),
-            leverage,
-            np.full((1, 2), np.nan),
-            np.ones(1, bool),
-        )
-
-    def covariance(self) -> tuple[FloatArray, float]:
-        """``(J^T J)^-1`` through singular values, and the condition number as in `likelihood.invert`."""
-        jacobian = self.jacobian.reshape(-1, self.theta.size)
-        column = np.linalg.norm(jacobian, axis=0)
-        n = column.size
-        if not (np.isfinite(column).all() and (column > 0).all()):
-            return np.full((n, n), np.nan), float("inf")
-        _, singular, vh = np.linalg.svd(jacobian / column, full_matrices=False)
-        if singular[-1] <= 0 or singular.size < n:
-            return np.full((n, n), np.nan), float("inf")
-        half = vh.T / singular
-        condition = (np.sum(singular**4) * np.sum(singular**-4.0)) ** 0.25
-        return half @ half.T / np.outer(column, column), float(condition)
+        if found.converged[0]:
+            solution.put(np.array([k]), found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +124,10 @@ def least_squares(
     start: FloatArray | None = None,
     delay_phase: FloatArray | None = None,
     first_size: FloatArray | None = None,
-) -> DenseSolution:
+) -> Solution:
     """Minimise the cost of one point at full precision, by orthogonal factorisations of the Jacobian.
+
+    A delay is the last entry of theta then.
 
     Parameters
     ----------
@@ -210,7 +137,7 @@ def least_squares(
     start : (s + M c,) float, optional
         Sanathanan-Koerner iterations when absent.
     delay_phase : (K,) float, optional
-        Phase [rad] per unit of delay; the delay is then the last entry of theta.
+        Phase [rad] per unit of delay.
     first_size : (K,) float, optional
         ``|A|`` that start values begin from; 1 when absent.
     """
@@ -247,34 +174,67 @@ def least_squares(
             except (ValueError, np.linalg.LinAlgError):  # nothing finite on the way
                 pass
         last = at(theta)
-        u_driven = data.u_driven[0]
-        size = np.abs(u_driven)
-        turn = np.where(size > 0, u_driven.conj() / size, 1.0)
-        residual = np.nan_to_num(last.residual)
-        turned = residual[:, problem.undriven :] * turn
-        jacobian = np.where(np.isfinite(last.variance)[:, None, None], last.jacobian, 0.0)
-        if converged:
-            rows = jacobian.reshape(-1, theta.size)
-            power = float(np.sum(np.abs(data.y[0][:, data.order]) ** 2 / data.variance[0]))
-            converged = _at_minimum(rows, residual.view(float).ravel(), ROUNDING**2 * power)
-    return DenseSolution(theta, jacobian, last.residual, turned, converged)
+        return _solution(problem, data, theta, last, converged)
+
+
+def _solution(
+    problem: Problem, data: BinData, theta: FloatArray, at: Linearised, converged: bool
+) -> Solution:
+    """That of a batch of one, (s + M c,) coefficients at which the errors are linearised.
+
+    Converged is what was found as such where one step more would lower the cost by as little as the last one of
+    `minimise`.
+    """
+    records, undriven, (a, b, own) = data.records, problem.undriven, problem.sizes
+    shared, n = a + b, theta.size - (records - 1) * own
+    residual, jacobian = at.residual, np.where(np.isfinite(at.variance)[:, None, None], at.jacobian, 0.0)
+    rows, errors = jacobian.reshape(-1, theta.size), np.nan_to_num(residual)
+    column = np.linalg.norm(rows, axis=0)
+    inverse, condition, fall = np.full((theta.size, theta.size), np.nan), np.inf, np.inf
+    if np.isfinite(rows).all():
+        scale = np.where(column > 0, column, 1.0)
+        directions, singular, vh = np.linalg.svd(rows / scale, full_matrices=False)
+        there = singular > np.finfo(float).eps * len(rows) * singular[0]
+        fall = float(np.sum((errors.view(float).ravel() @ directions[:, there]) ** 2))
+        determined = singular.size == theta.size and singular[-1] > 0
+        if determined and np.isfinite(column).all() and (column > 0).all():
+            half = vh.T / singular
+            inverse = half @ half.T / np.outer(scale, scale)
+            # as in `likelihood.invert`
+            condition = float((np.sum(singular**4) * np.sum(singular**-4.0)) ** 0.25)
+    free = max(len(rows) - theta.size, 1)
+    whole = ROUNDING**2 * float(np.sum(np.abs(data.y[0][:, data.order]) ** 2 / data.variance[0]))
+    converged &= fall <= max(STEP_TOLERANCE**2 * float(np.sum(np.abs(errors) ** 2)) / free, whole)
+    each, normal = np.empty((1, records, n)), np.empty((1, records, 2, n, n))
+    marginal = np.empty((1, records, n, n))
+    for m in range(records):
+        of_record = np.arange(shared + m * own, shared + (m + 1) * own)
+        columns = np.r_[:shared, of_record, shared + records * own : theta.size]
+        each[0, m], marginal[0, m] = theta[columns], inverse[np.ix_(columns, columns)]
+        for part, here in enumerate((slice(undriven), slice(undriven, None))):
+            of_part = jacobian[m, here][..., columns].reshape(-1, n)
+            normal[0, m, part] = of_part.T @ of_part
+    u, power = data.u_driven[0], np.sum(residual.real**2 + residual.imag**2, axis=0)
+    turn = np.where(np.abs(u) > 0, u.conj() / np.abs(u), 1.0)
+    part_cost = np.array([[power[:undriven].sum(), power[undriven:].sum()]])
+    return Solution(
+        each,
+        part_cost.sum(axis=1),
+        part_cost,
+        (errors[:, undriven:] * turn)[None],
+        np.array([converged]),
+        normal if records > 1 else normal[:0],
+        marginal,
+        np.array([condition]),
+        np.sum(marginal[:, :, None] * normal, axis=(1, 3, 4)),
+        np.full((1, 2), np.nan),
+        np.ones(1, bool),
+    )
 
 
 def _finite(values: FloatArray, otherwise: float) -> FloatArray:
     """Values with others in place of those that are not finite; themselves where all are."""
     return values if np.isfinite(values).all() else np.nan_to_num(values, nan=otherwise)
-
-
-def _at_minimum(jacobian: FloatArray, residual: FloatArray, rounding: float) -> bool:
-    """Whether a step (n,) from here would lower the cost by as little as the last one of `minimise`."""
-    if not np.isfinite(jacobian).all():
-        return False
-    column = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(column > 0, column, 1.0)
-    fall = float(np.sum((scaled @ np.linalg.lstsq(scaled, residual, rcond=None)[0]) ** 2))
-    cost = float(residual @ residual)
-    free = max(residual.size - column.size, 1)
-    return fall <= max(STEP_TOLERANCE**2 * cost / free, rounding)
 
 
 def linear_step(problem: Problem, data: BinData, size: FloatArray) -> FloatArray:

@@ -49,6 +49,8 @@ WIDEST = 1 / 8
 GRID = 1.5
 # Lines times modes that are tried, the widest ones: 64 MB.
 MOST_TRIED = 2_000_000
+# Modes that are tried in one pass for a better start.
+TRIED_AT_ONCE = 128
 # Points of a batch are asked where the cost is so many standard deviations above its expectation or,
 # where there is no cost, the residuals are this smooth (as a normal score): of clean ones 3 in a hundred.
 COST_ASKS, SMOOTHNESS_ASKS = 2.0, 1.5
@@ -79,14 +81,8 @@ class Directions:
         """Directions on ascending lines (K,), where the variable of the model is x (K,)."""
         tried = poles_tried(frequency_hz)  # the widest last
         pole = tried[-max(MOST_TRIED // frequency_hz.size, 1) :]
-        s = 2j * np.pi * frequency_hz[:, None]
-        above, below = 1 / (s - pole), 1 / (s - pole.conj())
-        phi = np.stack([above + below, 1j * (above - below)], axis=-1)  # (K, N, 2)
-        phi *= np.abs(pole.real)[:, None]
-        phi = phi.transpose(1, 2, 0)
-        modes = np.ascontiguousarray(np.stack([phi.real, phi.imag], axis=2))
         more = PolynomialBasis.on_lines(x, numerator_order + 2).values[:, numerator_order + 1 :]
-        return cls(pole, modes, np.ascontiguousarray(more))
+        return cls(pole, _responses(pole, frequency_hz), np.ascontiguousarray(more))
 
 
 def poles_tried(frequency_hz: FloatArray) -> ComplexArray:
@@ -101,6 +97,31 @@ def poles_tried(frequency_hz: FloatArray) -> ComplexArray:
         )
         width *= 2
     return np.asarray(2 * np.pi * np.concatenate(poles), complex)
+
+
+def _responses(poles_rad_s: ComplexArray, frequency_hz: FloatArray) -> FloatArray:
+    """(N, 2, 2, K) of modes with residues 1 and j, over their width, real and imaginary parts."""
+    s = 2j * np.pi * frequency_hz[:, None]
+    above, below = 1 / (s - poles_rad_s), 1 / (s - poles_rad_s.conj())
+    phi = np.stack([above + below, 1j * (above - below)], axis=-1)  # (K, N, 2)
+    phi *= np.abs(poles_rad_s.real)[:, None]
+    phi = phi.transpose(1, 2, 0)
+    return np.ascontiguousarray(np.stack([phi.real, phi.imag], axis=2))
+
+
+def most_missed(
+    plan: FitPlan, data: BinData, solution: Solution, tried: ComplexArray
+) -> tuple[complex, float]:
+    """Of modes (N,) the one that a fit of one point lacks most, and the logarithm of its chance in noise."""
+    fall = np.empty(0)
+    # not all at once: those tried are about as many as lines
+    for part in np.array_split(tried, -(-tried.size // TRIED_AT_ONCE)):
+        modes, inverse = _responses(part, plan.frequency_hz), solution.marginal[:, 0]
+        none = np.zeros((plan.frequency_hz.size, 2), complex)
+        of_fit = data, plan.problem.driven_bases, solution.theta, inverse, none, modes
+        fall = np.append(fall, _falls(*of_fit, solution.cost, np.ones(1))[0][0, 1:])
+    k, dof = int(np.argmax(fall)), data.lines[0] - solution.theta.size / 2
+    return complex(tried[k]), float((dof - 1) * np.log1p(-fall[k] / solution.cost[0]) + np.log(tried.size))
 
 
 @np.errstate(invalid="ignore")

@@ -20,7 +20,6 @@ from tactile_resonance.poles import likelihood
 from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
-    DenseSolution,
     Linearised,
     least_squares,
     linear_step,
@@ -372,8 +371,8 @@ class LinesPlan(FitPlan):
             return self.rebased(data)._fit_dense(data)
         for k in doubtful:
             dense = least_squares(self.problem, data.rows(slice(k, k + 1)))
-            if dense.cost <= solution.cost[k] * (1 + 1e-9) or not converged[k]:
-                solution.put(np.array([k]), dense.solution(self.problem))
+            if dense.cost[0] <= solution.cost[k] * (1 + 1e-9) or not converged[k]:
+                solution.put(np.array([k]), dense)
         return self, solution
 
     def compared(self, data: BinData, start: FloatArray | None = None) -> ComplexArray:
@@ -422,7 +421,7 @@ class LinesPlan(FitPlan):
             return plan
         row = _first_usable(data)
         found = least_squares(plan.problem, row, None, None, plan.start_size)
-        return exchanged(plan, row, found)[0] if np.isfinite(found.cost) else plan
+        return exchanged(plan, row, found)[0] if np.isfinite(found.cost[0]) else plan
 
     def of_size(self, row: BinData, size: FloatArray) -> LinesPlan | None:
         """Plan with bases orthonormal in the weights of a point where ``|A|^2`` is `size` (F,).
@@ -462,9 +461,9 @@ class LinesPlan(FitPlan):
     def _fit_dense(self, data: BinData) -> tuple[LinesPlan, Solution]:
         """Point by point."""
         rows = (data.rows(slice(k, k + 1)) for k in range(len(data.y)))
-        return self, Solution.joined([self._best_of_starts(row).solution(self.problem) for row in rows])
+        return self, Solution.joined([self._best_of_starts(row) for row in rows])
 
-    def _best_of_starts(self, row: BinData) -> DenseSolution:
+    def _best_of_starts(self, row: BinData) -> Solution:
         """Of several starts the one with the least cost."""
         phase, starts = self._delay_phase, list[FloatArray | None]([None])
         if phase is not None:
@@ -472,8 +471,8 @@ class LinesPlan(FitPlan):
         solutions = [
             least_squares(self.problem, row, start, phase, self.start_size) for start in starts
         ]
-        finite = [s for s in solutions if np.isfinite(s.cost)]
-        best = min(finite or solutions, key=lambda s: s.cost)
+        finite = [s for s in solutions if np.isfinite(s.cost[0])]
+        best = min(finite or solutions, key=lambda s: float(s.cost[0]))
         if phase is None and finite and self.structure.order > LARGEST_BATCHED_ORDER:
             best = moved_to(self, row, *exchanged(self, row, best))
         return best

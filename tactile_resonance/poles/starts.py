@@ -20,14 +20,13 @@ import numpy as np
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
-    DenseSolution,
     Linearised,
     least_squares,
     minimise,
     numerator_columns,
     real_solution,
 )
-from tactile_resonance.poles.lacking import LEAST_LEFT, poles_tried
+from tactile_resonance.poles.lacking import most_missed, poles_tried
 from tactile_resonance.poles.likelihood import Solution
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ APART = 0.7
 CHANCE = 0.3
 # Starts that are tried before a minimum is taken for the deepest, those of the least cost first.
 STARTS = 3
-# Poles at which a mode is tried, and points that start anew, in one pass: of many lines more take gigabytes.
+# Points that start anew in one pass: of many lines more take gigabytes.
 AT_ONCE = 128
 
 
@@ -123,12 +122,12 @@ def _coefficients(plan: FitPlan, data: BinData, poles: ComplexArray) -> FloatArr
 
 @np.errstate(all="ignore")
 def exchanged(
-    plan: LinesPlan, row: BinData, found: DenseSolution
-) -> tuple[LinesPlan, DenseSolution]:
+    plan: LinesPlan, row: BinData, found: Solution
+) -> tuple[LinesPlan, Solution]:
     """The deepest minimum that is found by moving modes of a solution of one point; bases that suit it."""
     tried = poles_tried(plan.frequency_hz)
     for _ in range(2 * plan.structure.order):
-        missing, chance = _most_lacking(plan, row, found, tried)
+        missing, chance = most_missed(plan, row, found, tried)
         if not chance < np.log(CHANCE):
             break
         more = np.array([missing, np.conj(missing)])
@@ -136,7 +135,7 @@ def exchanged(
         starts.sort(key=lambda poles: _cost_from(plan, row, poles))
         for start in starts[:STARTS]:
             again = _minimum_from(plan, row, start)
-            if again is not None and again[1].cost < found.cost * (1 - 1e-9):
+            if again is not None and again[1].cost[0] < found.cost[0] * (1 - 1e-9):
                 plan, found = again
                 break
         else:
@@ -146,8 +145,8 @@ def exchanged(
 
 @np.errstate(all="ignore")
 def moved_to(
-    plan: LinesPlan, row: BinData, there: LinesPlan, found: DenseSolution
-) -> DenseSolution:
+    plan: LinesPlan, row: BinData, there: LinesPlan, found: Solution
+) -> Solution:
     """A solution of one plan as that of another one."""
     if there is plan:
         return found
@@ -155,13 +154,13 @@ def moved_to(
     return least_squares(plan.problem, row, start, None, plan.start_size)
 
 
-def _poles(plan: LinesPlan, solution: DenseSolution) -> ComplexArray:
-    return plan.model_of(solution.theta[None]).poles_rad_s()[0]
+def _poles(plan: LinesPlan, solution: Solution) -> ComplexArray:
+    return plan.model_of(solution.theta[:, 0]).poles_rad_s()[0]
 
 
 def _minimum_from(
     plan: LinesPlan, row: BinData, poles: ComplexArray
-) -> tuple[LinesPlan, DenseSolution] | None:
+) -> tuple[LinesPlan, Solution] | None:
     """Fit that begins with these poles, of a plan with bases that suit them; None where there is none."""
     logarithm = 2 * np.sum(np.log(np.abs(plan.x[:, None] - plan.variable.of_s(poles))), axis=-1)
     there = plan.of_size(row, np.exp(logarithm - logarithm.mean()))
@@ -169,7 +168,7 @@ def _minimum_from(
     if there is None or start is None or not np.isfinite(start).all():
         return None
     solution = least_squares(there.problem, row, start, None, there.start_size)
-    return (there, solution) if np.isfinite(solution.cost) else None
+    return (there, solution) if np.isfinite(solution.cost[0]) else None
 
 
 def _one_less(poles: ComplexArray) -> list[ComplexArray]:
@@ -181,50 +180,6 @@ def _one_less(poles: ComplexArray) -> list[ComplexArray]:
         *(np.concatenate([np.delete(above, k), np.delete(below, m), real]) for k, m in enumerate(mirrored)),
         *(np.concatenate([above, below, np.delete(real, [k, k + 1])]) for k in range(0, real.size - 1, 2)),
     ]
-
-
-def _most_lacking(
-    plan: LinesPlan, row: BinData, solution: DenseSolution, tried: ComplexArray
-) -> tuple[complex, float]:
-    """The mode that is missed most, and the logarithm of how likely noise alone misses it; see `lacking`."""
-    variance = row.variance[0]
-    used = np.isfinite(variance)
-    jacobian = solution.jacobian[0][used].reshape(-1, solution.theta.size)
-    basis = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0]
-    residual = np.ascontiguousarray(solution.residual[0][used]).view(float)
-    s = np.asarray(2j * np.pi * plan.frequency_hz[used][:, None])
-    weight = (row.u[0, 0][used] / np.sqrt(variance[used]))[:, None]
-    # not all at once: those tried are about as many as lines
-    parts = np.array_split(tried, -(-tried.size // AT_ONCE))
-    fall = np.concatenate([_falls(s, weight, basis, residual, part) for part in parts])
-    k = int(np.argmax(fall))
-    dof = used.sum() - solution.theta.size / 2
-    return complex(tried[k]), float((dof - 1) * np.log1p(-fall[k] / solution.cost) + np.log(tried.size))
-
-
-def _falls(
-    s: ComplexArray,
-    weight: ComplexArray,
-    basis: FloatArray,
-    residual: FloatArray,
-    tried: ComplexArray,
-) -> FloatArray:
-    """(N,) by how much a mode at each of N poles lets the cost fall, in the first step.
-
-    At s (K, 1), where `weight` (K, 1) makes a response a residual (2 K,), with an orthonormal `basis`
-    (2 K, parameters) of the directions that the model has already.
-    """
-    above, below = 1 / (s - tried), 1 / (s - tried.conj())
-    scaled = np.abs(tried.real) * weight
-    pair = np.stack([(above + below) * scaled, 1j * (above - below) * scaled])  # (2, K, N)
-    step = np.stack([pair.real, pair.imag], axis=2).reshape(2, -1, tried.size)
-    whole = np.sum(step[0] ** 2, axis=0) * np.sum(step[1] ** 2, axis=0)
-    step = step - basis @ (basis.T @ step)
-    score = residual @ step  # (2, N)
-    p_00, p_11, p_01 = (np.sum(step[i] * step[j], axis=0) for i, j in ((0, 0), (1, 1), (0, 1)))
-    determinant = p_00 * p_11 - p_01**2
-    fall = (p_11 * score[0] ** 2 - 2 * p_01 * score[0] * score[1] + p_00 * score[1] ** 2) / determinant
-    return np.where(determinant > LEAST_LEFT * whole, fall, 0.0)
 
 
 def _cost_from(plan: LinesPlan, row: BinData, poles: ComplexArray) -> float:
