@@ -142,6 +142,15 @@ def test_a_covariance_lost_to_rounding_is_none():
     assert np.all(np.isnan(batch.f0_hz[batch.has_status(PolesStatus.ILL_CONDITIONED)]))
 
 
+def test_a_mode_that_noise_makes_is_none_where_its_residue_is_lost_to_rounding():
+    """Of a flat response at 180 dB, squares of the condition number cancel in the variance of the residue."""
+    rng = np.random.default_rng(1)
+    noise = 1e-10 * rng.standard_normal((60, 41, 2)).view(complex)[..., 0] / np.sqrt(2)
+    given = frf(LINES_HZ, 0.1 + noise, variance_noise=np.full((60, 41), 1e-20), noise_dof=1000)
+    batch = identify_batch(given, None, BARE)
+    assert {batch.status(k) for k in range(60)} <= {PolesStatus.NO_RESONANCE, PolesStatus.ILL_CONDITIONED}
+
+
 @pytest.mark.parametrize("spacing", [np.geomspace, np.linspace])
 def test_twenty_poles_over_three_decades(spacing):
     f0_hz = 10 * 10 ** (np.arange(10) / 3)
