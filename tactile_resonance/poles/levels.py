@@ -23,7 +23,7 @@ from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BINS_PER_BAND, BinData
-from tactile_resonance.poles.likelihood import Solution, invert, moments
+from tactile_resonance.poles.likelihood import Solution, half_inverse, invert, moments, sandwich
 from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.noise_level import (
@@ -323,10 +323,9 @@ class Spread:
         a, b, _ = plan.problem.sizes
         batch, records, n = theta.shape
         _, gradient, normal = moments(plan.problem.tables, data, theta)
-        inverse = invert(normal.sum(axis=2).reshape(-1, n, n))[0]
-        step = -(inverse @ gradient.reshape(-1, n, 1))[:, : a + b, 0]
-        inverse = inverse[:, :a]  # (batch M, a, n)
-        covariance = 0.5 * inverse @ inner.reshape(-1, n, n) @ inverse.swapaxes(-1, -2)
+        half = half_inverse(normal.sum(axis=2).reshape(-1, n, n))
+        step = -(half.swapaxes(-1, -2) @ (half @ gradient.reshape(-1, n, 1)))[:, : a + b, 0]
+        covariance = 0.5 * sandwich(half, inner.reshape(-1, n, n))[:, :a, :a]
         step = step.reshape(batch, records, a + b)
         covariance = covariance.reshape(batch, records, a, a)
         poles = plan.poles_in_band(theta[:, 0])

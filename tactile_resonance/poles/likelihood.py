@@ -23,6 +23,7 @@ for all of them; each goes its own way.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -163,23 +164,49 @@ class Solution(NamedTuple):
 
     def inverse(self, shared: int) -> FloatArray:
         """(points, s + M c, s + M c) of the normal matrix of all coefficients; NaN where `marginal` is."""
-        points, records, n = self.theta.shape
-        if records == 1:
+        if self.theta.shape[1] == 1:
             return self.marginal[:, 0]
-        normal, own = self.normal.sum(axis=2), n - shared
-        whole = np.zeros((points, *2 * [shared + records * own]))
-        whole[:, :shared, :shared] = normal[:, :, :shared, :shared].sum(axis=1)
-        for m in range(records):
-            here = slice(shared + m * own, shared + (m + 1) * own)
-            whole[:, here, :shared] = normal[:, m, shared:, :shared]
-            whole[:, :shared, here] = normal[:, m, :shared, shared:]
-            whole[:, here, here] = normal[:, m, shared:, shared:]
-        return invert(whole)[0]
+        return invert(_of_all(self.normal.sum(axis=2), shared))[0]
 
     def sandwich(self, normal: FloatArray, shared: int) -> FloatArray:
         """(points, s, s) of the shared coefficients, of gradients with covariances (points, M, n, n)."""
-        rows = self.marginal[:, :, :shared]
-        return np.einsum("bmik,bmkl,bmjl->bij", rows, normal, rows)
+        half = half_inverse(_of_all(self.normal.sum(axis=2), shared))
+        return sandwich(half, _of_all(normal, shared))[:, :shared, :shared]
+
+
+def _of_all(normal: FloatArray, shared: int) -> FloatArray:
+    """(points, s + M c, s + M c) of all coefficients from (points, M, n, n) of those of each record."""
+    points, records, n = normal.shape[:3]
+    own = n - shared
+    whole = np.zeros((points, *2 * [shared + records * own]))
+    whole[:, :shared, :shared] = normal[:, :, :shared, :shared].sum(axis=1)
+    for m in range(records):
+        here = slice(shared + m * own, shared + (m + 1) * own)
+        whole[:, here, :shared] = normal[:, m, shared:, :shared]
+        whole[:, :shared, here] = normal[:, m, :shared, shared:]
+        whole[:, here, here] = normal[:, m, shared:, shared:]
+    return whole
+
+
+def half_inverse(matrices: FloatArray) -> FloatArray:
+    """Matrices H (batch, n, n) whose ``H^T H`` are the inverses of positive definite ones.
+
+    NaN where one is not positive definite to rounding. What stands between two inverses is to be taken between
+    H and ``H^T`` first, where it is about a unit matrix: else what is small beside the largest variance is lost
+    to rounding.
+    """
+    half = np.full(matrices.shape, np.nan)
+    for k, matrix in enumerate(matrices):
+        scale = 1 / np.sqrt(np.diagonal(matrix))
+        with suppress(np.linalg.LinAlgError):
+            half[k] = np.linalg.inv(np.linalg.cholesky(matrix * np.outer(scale, scale))) * scale
+    return half
+
+
+def sandwich(half: FloatArray, middle: FloatArray) -> FloatArray:
+    """(batch, n, n) ``H^T H middle H^T H`` of a `half_inverse`."""
+    across = half.swapaxes(-1, -2)
+    return across @ (half @ middle @ across) @ half
 
 
 class _Work(NamedTuple):

@@ -442,21 +442,26 @@ class LinesPlan(FitPlan):
     @np.errstate(divide="ignore", invalid="ignore")
     def propagated(self, solution: Solution, data: BinData, noise: FloatArray) -> FloatArray:
         """Covariance (batch, n, n) of a solution where the variance (batch, F) is not that of `data`."""
-        finite = np.isfinite(data.variance_y)
-        inverse = solution.marginal[:, 0]
-        if self.structure.delay or self.weights is not None:  # fitted point by point
-            normal = np.empty_like(inverse)
-            for k, used in enumerate(finite):
-                row = data.rows(slice(k, k + 1))
-                at = Linearised.of(self.problem, row, solution.theta[k, 0], self._delay_phase)
-                ratio = noise[k, used] / data.variance_y[k, used]
-                jacobian = at.jacobian[0, used]  # (F, 2, n)
-                normal[k] = np.einsum("fpi,f,fpj->ij", jacobian, ratio, jacobian)
-        else:
-            more = np.where(finite, data.variance_y**2 / noise, np.inf)
-            weighted = data.weighted(variance_y=more)
-            normal = likelihood.moments(self.problem.tables, weighted, solution.theta)[2][:, 0, 1]
-        return 0.5 * inverse @ normal @ inverse
+        finite, by_one = np.isfinite(data.variance_y), self.structure.delay or self.weights is not None
+        alone = by_one | ~(solution.condition < NORMAL_EQUATIONS_LIMIT)
+        covariance = np.full_like(solution.marginal[:, 0], np.nan)
+        if not alone.all():
+            more = data.weighted(variance_y=np.where(finite, data.variance_y**2 / noise, np.inf))
+            own, normal = (
+                likelihood.moments(self.problem.tables, weighted, solution.theta)[2][:, 0, 1]
+                for weighted in (data, more)
+            )
+            covariance = 0.5 * likelihood.sandwich(likelihood.half_inverse(own), normal)
+        for k in np.flatnonzero(alone):
+            row, used = data.rows(slice(k, k + 1)), finite[k]
+            at = Linearised.of(self.problem, row, solution.theta[k, 0], self._delay_phase)
+            jacobian = at.jacobian[0, used].reshape(-1, covariance.shape[-1])  # (2 F, n)
+            column = np.linalg.norm(jacobian, axis=0)
+            if np.isfinite(column).all() and (column > 0).all():
+                ratio = np.repeat(noise[k, used] / data.variance_y[k, used], 2)
+                inverse = np.linalg.pinv(jacobian / column) / column[:, None]
+                covariance[k] = 0.5 * (inverse * ratio) @ inverse.T
+        return covariance
 
     def _fit_dense(self, data: BinData) -> tuple[LinesPlan, Solution]:
         """Point by point."""

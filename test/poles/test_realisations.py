@@ -363,6 +363,19 @@ def test_scaled_data_scale_nothing(scale):
     assert other.total_covariance == pytest.approx(first.total_covariance, rel=1e-3)
 
 
+@pytest.mark.parametrize("snr_db", [60.0, 80.0])
+def test_an_ellipse_beside_a_mode_too_many_is_not_made_by_rounding(snr_db):
+    """A factor 3 of the output is only another unit: deviations were up to 200 times as large in it."""
+    u, y = spectra(plants(0.02, snr_db, 2, 4), np.random.default_rng(10), 20)
+    plan = plan_of(2, ModelStructure.with_residual(4))
+    first, other = (plan.from_bins(u, factor * y) for factor in (1.0, 3.0))
+    assert np.array_equal(first.significant, other.significant)
+    here = first.significant & first.has_status(PolesStatus.OK)[:, None]
+    assert here.sum() > 15
+    one, two = (np.sqrt(result.total_covariance[here][:, 0, 0]) for result in (first, other))
+    assert two == pytest.approx(one, rel=0.05)
+
+
 def test_a_system_that_changes_between_realisations_is_told():
     """Noise and distortion would differ from line to line; a mode that moves does not."""
     rng = np.random.default_rng(11)

@@ -151,6 +151,21 @@ def test_a_mode_that_noise_makes_is_none_where_its_residue_is_lost_to_rounding()
     assert {batch.status(k) for k in range(60)} <= {PolesStatus.NO_RESONANCE, PolesStatus.ILL_CONDITIONED}
 
 
+def test_noise_that_is_a_part_of_all_is_that_part_of_the_covariance():
+    """However little the data say of a second mode: between inverses that would be lost to rounding."""
+    f = np.linspace(200, 300, 81)
+    g = modal(f, [240.0, 262.0], [0.02, 0.02], [0.04, 4e-8])
+    variance = 1e-14 * np.mean(np.abs(g) ** 2)
+    rng = np.random.default_rng(7)
+    g = g + rng.standard_normal((20, f.size, 2)).view(complex)[..., 0] * np.sqrt(variance / 2)
+    noise = variance * rng.gamma(14, 1 / 14, g.shape)
+    fields = {"variance_noise": noise, "noise_dof": 14, "variance_total": 1.2 * noise, "total_dof": 14}
+    batch = identify_batch(frf(f, g, **fields), None, ModelStructure(4, 4))
+    assert np.all(batch.has_status(PolesStatus.OK))
+    ratio = batch.total_covariance[..., 0, 0] / batch.covariance[..., 0, 0]
+    assert ratio == pytest.approx(1.2, rel=0.4)
+
+
 @pytest.mark.parametrize("spacing", [np.geomspace, np.linspace])
 def test_twenty_poles_over_three_decades(spacing):
     f0_hz = 10 * 10 ** (np.arange(10) / 3)
