@@ -162,7 +162,8 @@ def systematic_of(
     for parity in (0, 1):
         left_out = np.arange(data.driven) % 2 == parity
         half = data.weighted(variance_y=np.where(left_out, np.inf, data.variance_y))
-        poles.append(plan.compared(half, theta))
+        determined = half.lines >= plan.structure.fewest_lines
+        poles.append(np.where(determined[:, None], plan.compared(half, theta), np.nan))
     moved = difference_of_halves(*poles)
     half_of = data.records // 2
     if half_of > 0:

@@ -166,6 +166,17 @@ def test_noise_that_is_a_part_of_all_is_that_part_of_the_covariance():
     assert ratio == pytest.approx(1.2, rel=0.4)
 
 
+def test_halves_of_too_few_lines_say_nothing_of_a_model_error():
+    """Three of six lines do not determine ten parameters: what they make of a pole is rounding."""
+    f = np.linspace(230, 280, 6)
+    g = modal(f, [250, 262], [0.02, 0.02], [0.04, 0.03])
+    fields = {"variance_noise": np.full(6, 1e-10), "noise_dof": 1000}
+    poles = identify_frf(frf(f, g, **fields), None, ModelStructure())
+    assert poles.status is PolesStatus.MODEL_ERROR
+    half_width_hz = poles.f0_hz[0] * poles.damping_ratio[0]
+    assert poles.total_covariance[0, 0, 0] > half_width_hz**2
+
+
 @pytest.mark.parametrize("spacing", [np.geomspace, np.linspace])
 def test_twenty_poles_over_three_decades(spacing):
     f0_hz = 10 * 10 ** (np.arange(10) / 3)
