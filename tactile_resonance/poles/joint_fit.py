@@ -227,6 +227,7 @@ def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
     far above the output's or the same in both. Where the noise then looks other than flat, or the model
     wrong, its level is taken once more, from where the fit ended.
     """
+    u = _without_rounding(plan, u)
     judged = _fit(plan, u, y)
     doubtful = np.full(len(y), _returns(plan, y.shape[1]))
     for _ in range(MOST_RETURNS):
@@ -240,6 +241,24 @@ def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
         judged.put(rows, _fit(plan, u[rows], y[rows], judged.theta[rows, None]))
         doubtful[rows] &= np.abs(judged.noise_variance[rows, 0] - before) > SAME_LEVEL * before
     return judged
+
+
+def _without_rounding(plan: JointPlan, u: ComplexArray) -> ComplexArray:
+    """Inputs (batch, M, K) that are 0 between harmonics where there is no more than rounding.
+
+    Of an exact input rounding is not flat, and would by chance be weighted like noise that is not.
+    """
+    if not plan.others_at.size:
+        return u
+    between, driven = (
+        np.mean(u.real[..., at] ** 2 + u.imag[..., at] ** 2, axis=(1, 2))
+        for at in (plan.others_at, plan.excited_at)
+    )
+    exact = between <= ROUNDED * driven
+    if exact.any():
+        u = u.copy()
+        u[np.ix_(exact, np.ones(u.shape[1], bool), plan.others_at)] = 0.0
+    return u
 
 
 def _returns(plan: JointPlan, records: int) -> bool:

@@ -109,6 +109,21 @@ def test_scaled_data_scale_nothing_but_residues():
         assert other.residues * scale == pytest.approx(first.residues, rel=1e-6)
 
 
+def test_rounding_of_an_exact_input_is_no_noise():
+    """Between harmonics it is not flat: a fourth of such records was weighted line by line for it."""
+    rng, lines, samples = np.random.default_rng(12), np.arange(80, 121), 2000
+    spectrum = np.zeros(samples // 2 + 1, complex)
+    spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size))
+    s, w0 = 2j * np.pi * np.arange(spectrum.size) * 2.5, 2 * np.pi * 250
+    answer = spectrum * (0.1 + 0.04 * w0**2 / (s**2 + 0.04 * w0 * s + w0**2))
+    u, y = (np.tile(np.fft.irfft(of), (8, 1)) for of in (spectrum, answer))
+    scale = rng.uniform(0.5, 2, (60, 1, 1))
+    y = scale * y + 1e-3 * y.std() * rng.standard_normal((60, *y.shape))
+    result = JointPlan(5e3, samples, 8, lines, (200.0, 300.0))(scale * u, y)
+    assert np.all(result.noise_variance[:, 1] == 0)
+    assert np.all(result.variance_model == "flat")
+
+
 def test_default_structure_finds_the_bare_plant_too():
     plant = Plant(0.05, 40.0, 8)
     u, y = plant.noisy(np.random.default_rng(6), 200, plant.bins())
