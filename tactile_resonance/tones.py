@@ -111,6 +111,8 @@ FIRST_BIN = 16
 MOST_NAMED = 12
 DRIVEN = 100
 """Power at excited lines over that between them, above which a record was not taken without drive."""
+EXACT = 1e-28
+"""Power of a tone over that of the signal: what is smaller double precision makes."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,8 @@ def silent_record(
             )
         density = np.median(level[kind]) * 2 / (sample_rate_hz * np.sum(window**2))
         noise.append(float(np.sqrt(density)))
-        for at, size in _peaks(power, kind, level, len(pieces), around):
+        least = EXACT * np.mean(pieces**2) * np.sum(window) ** 2
+        for at, size in _peaks(power, kind & (power > least), level, len(pieces), around):
             rms_v = np.sqrt(2 * size) / np.sum(window)
             tones.append(Tone(float(at * resolution_hz), float(rms_v), channel, resolution_hz))
     tones.sort(key=lambda tone: -tone.rms_v)
@@ -263,17 +266,15 @@ def _pieces(x: FloatArray) -> FloatArray:
 
 
 def _peaks(
-    power: FloatArray, kind: BoolArray, level: FloatArray, records: int, around: int
+    power: FloatArray, used: BoolArray, level: FloatArray, records: int, around: int
 ) -> list[tuple[float, float]]:
     """Place, in bins, and power of each peak that noise would not make."""
     dof = records * around * DOF_OF_A_BIN
     chance = np.ones(power.size)
-    # of exact silence nothing stands out
-    used = kind & (power > 0)
     ratio = power[used] / np.maximum(level[used], np.finfo(float).tiny)
     chance[used] = special.fdtrc(2 * records, 2 * dof, ratio)
     found = []
-    for k in np.flatnonzero(chance * np.count_nonzero(kind) < _FALSE_ALARM):
+    for k in np.flatnonzero(used & (chance * np.count_nonzero(used) < _FALSE_ALARM)):
         near = power[k - MAIN_LOBE : k + MAIN_LOBE + 1]
         if near.size < 2 * MAIN_LOBE + 1 or power[k] < near.max():
             continue

@@ -35,6 +35,15 @@ def test_tones_and_noise_are_those_put_in():
     assert [tone.mains_hz for tone in found.tones] == [(50.0,), (50.0,), ()]
 
 
+@pytest.mark.parametrize("volts", [0.1, 1 / 3])
+def test_rounding_is_no_tone(volts):
+    """Of a channel that stands still, and beside a tone without noise: peaks of 1e-16 of it were named."""
+    still, alone = np.full((PERIODS, SAMPLES), volts), tones((50.0, 0.7))
+    with np.errstate(divide="raise"):
+        found = silent_record(still, alone, sample_rate_hz=RATE_HZ)
+    assert [(tone.channel, round(tone.frequency_hz)) for tone in found.tones] == [("sensor", 50)]
+
+
 def test_noise_is_no_tone():
     """White, and that of a random walk, whose density falls by 20 dB a decade."""
     rng = np.random.default_rng(2)
