@@ -223,7 +223,9 @@ def with_noise(
     free = size / max(size - problem.sizes[2] * records / 2, 1.0)  # of what the transients have left
     pieces = _pieces_between(data.undriven, records)
     total_power, _ = _by_piece(error, pieces, free)
-    rest_power, kind_rest = _by_piece(rest, pieces, free)
+    # of an input that is known but for the noise of its voltmeter, which comes in through the response
+    of_u = np.where(generator, _power(response.repeat(records, axis=1)), 0.0)
+    rest_power, kind_rest = _by_piece(rest, pieces, free, of_u if generator.any() else None)
     input_power, kind_u = _by_piece(u, pieces, 1.0)
     measured = np.where(common, total_power, rest_power)
     variance_u = np.where(generator, 0.0, input_power)
@@ -276,20 +278,27 @@ def _powers(
 
 
 def _by_piece(
-    values: ComplexArray, pieces: Pieces, factor: float
+    values: ComplexArray, pieces: Pieces, factor: float, gain: FloatArray | None = None
 ) -> tuple[FloatArray, IntArray]:
     """(batch, 1) or (batch, pieces) variance, and its kind as index into `KINDS`.
 
-    Flat unless a test says otherwise.
+    Flat unless a test says otherwise; ``a + b gain`` where a gain is given, of each value.
     """
     mean = _mean_power(values) * factor
-    samples = pieces.means(values.real**2 + values.imag**2)
-    if pieces.starts.size < FEWEST_PIECES or bool(are_flat(samples, pieces.dof).all()):
+    samples = pieces.means(_power(values))
+    if pieces.starts.size < FEWEST_PIECES or (gain is None and bool(are_flat(samples, pieces.dof).all())):
         return mean, np.zeros(mean.shape[0], np.int64)
-    model = model_variance(samples * factor, pieces.dof)
-    return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
+    model = model_variance(samples * factor, pieces.dof, None if gain is None else pieces.means(gain))
+    flat = model.kind[:, None] == 0
+    if gain is not None:
+        flat &= ~gain.any(axis=1, keepdims=True)
+    return np.where(flat, mean, model.variance), model.kind
+
+
+def _power(values: ComplexArray) -> FloatArray:
+    return np.asarray(values.real**2 + values.imag**2)
 
 
 def _mean_power(values: ComplexArray) -> FloatArray:
     """(batch, 1)."""
-    return np.asarray(np.mean(values.real**2 + values.imag**2, axis=-1, keepdims=True))
+    return np.asarray(np.mean(_power(values), axis=-1, keepdims=True))

@@ -292,8 +292,11 @@ def _fit(
     judged = judge(_Round(plan, plain, data, solution, noise, np.zeros(len(y), np.int64)))
     others = np.flatnonzero(~solution.plain)
     if others.size:
-        theta = solution.theta[others]
-        judged.put(others, judge(_Round.weighted_with_noise(plan, plain.rows(others), theta)))
+        data, theta = plain.rows(others), solution.theta[others]
+        if plain.records == 1:  # until now the transient was fitted with what comes through the input as noise
+            first = _Round.weighted_with_noise(plan, data, theta).solution
+            theta = np.where(_may_return(first)[:, None, None], first.theta, theta)
+        judged.put(others, judge(_Round.weighted_with_noise(plan, data, theta)))
     return judged
 
 

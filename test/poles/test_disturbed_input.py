@@ -13,6 +13,7 @@ from tactile_resonance.frf.result import FrfStatus, band_bins
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles import estimator
 from tactile_resonance.poles.estimator import identify_poles_from_records
+from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.recording.recording import Recording
@@ -84,6 +85,18 @@ def test_noise_of_the_voltmeter_beside_a_disturbance():
     assert all(p.method.endswith("all bins as excitation") for p in found)
     inside = sum(distance(p) < stats.chi2.ppf(0.95, 2) for p in found)
     assert stats.binom.cdf(inside, 40, 0.95) > 1e-3  # 27 of 40 with alike weights
+
+
+def test_noise_of_the_voltmeter_counts_most_at_the_resonance():
+    """A weak disturbance is known input, but for the voltmeter's noise, which comes in through the response."""
+    noise = {"kind": "white", "generator": 0.03, "voltmeter_u": 3e-3, "noise_y": 3e-3, "periods": 4}
+    u, y = np.swapaxes([record(seed, **noise) for seed in range(600)], 0, 1)
+    plan = JointPlan(RATE_HZ, SAMPLES, 4, ODD, BAND_HZ, ModelStructure())
+    found = plan(u, y)
+    error = np.stack([found.f0_hz[:, 0] - F0_HZ, found.damping_ratio[:, 0] - DAMPING_RATIO], -1)
+    squared = np.sum(error * np.linalg.solve(found.covariance[:, 0], error[..., None])[..., 0], -1)
+    outside = np.count_nonzero(squared > stats.chi2.isf(0.05, 2))
+    assert stats.binom.sf(outside - 1, squared.size, 0.05) > 1e-3
 
 
 @pytest.mark.parametrize("kind", ["white", "narrow"])
