@@ -200,10 +200,10 @@ def with_noise(
 
     Notes
     -----
-    Noise of the two voltmeters is independent. Where U and Y are correlated beyond chance the
-    disturbance either went through the system (noise of the generator: then it is a known input, no
-    measurement noise) or into both channels alike; the first is taken where it explains some of Y and
-    the second not much more.
+    Noise of the two voltmeters is independent. Where U, or what the response makes of it, and Y are correlated
+    beyond chance the disturbance either went through the system (noise of the generator: then it is a known
+    input, no measurement noise) or into both channels alike; the first is taken where it explains some of Y
+    and the second not much more.
     """
     problem, records = plan.problem, data.records
     alpha, beta, gamma = problem.split(theta)
@@ -216,7 +216,8 @@ def with_noise(
     power_error, power_u, cross, correlated = _powers(error, u)
     by_g, gain = response.repeat(records, axis=1) * u, cross / np.maximum(power_u, TINY)
     rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
-    generator = correlated & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
+    seen = correlated | _powers(error, by_g)[3]  # over a mode the phase of the response turns
+    generator = seen & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
     common = correlated & ~generator
     through = np.where(generator, by_g, np.where(common, gain * u, 0.0))
     rest, size = error - through, error.shape[1]
@@ -229,7 +230,7 @@ def with_noise(
     input_power, kind_u = _by_piece(u, pieces, 1.0)
     measured = np.where(common, total_power, rest_power)
     variance_u = np.where(generator, 0.0, input_power)
-    if correlated.any():
+    if seen.any():
         y = data.y.copy()
         y[..., others] -= through.reshape(len(y), -1, records).swapaxes(1, 2)
         data = data._replace(y=y)

@@ -99,6 +99,24 @@ def test_noise_of_the_voltmeter_counts_most_at_the_resonance():
     assert stats.binom.sf(outside - 1, squared.size, 0.05) > 1e-3
 
 
+@pytest.mark.parametrize("apart", [1.5e-6, 1.5e-5, 1.5e-4])
+def test_clocks_that_differ_change_no_mode(apart):
+    """Lines then spread over the bins beside them, in the measured input as in the output."""
+    rng = np.random.default_rng(7)
+    t, harmonics = np.arange(2 * SAMPLES) / RATE_HZ, np.arange(40, 161)
+    s, w0 = 2j * np.pi * harmonics * RATE_HZ / SAMPLES * (1 + apart), 2 * np.pi * F0_HZ
+    lines = np.exp(2j * np.pi * rng.random(harmonics.size)) * np.sqrt(2 / harmonics.size)
+    g = 0.1 + 0.04 * w0**2 / (s**2 + 2 * DAMPING_RATIO * w0 * s + w0**2)
+    exact = [np.real(np.exp(np.outer(t, s)) @ of).reshape(2, SAMPLES) for of in (lines, lines * g)]
+    found = [
+        identify(*(x + 1e-3 * rng.standard_normal(x.shape) for x in exact), harmonics) for _ in range(12)
+    ]
+    assert all(poles.status is PolesStatus.OK for poles in found)
+    assert stats.chi2.sf(sum(distance(poles) for poles in found), 24) > 1e-3
+    bound_hz = 1.17e-3  # deviation of f0 from the same noise with one clock
+    assert all(poles.main.std[0] < 2 * bound_hz for poles in found)
+
+
 @pytest.mark.parametrize("kind", ["white", "narrow"])
 def test_noise_of_the_voltmeter_alone_is_no_excitation(kind):
     for seed in range(4):
