@@ -178,6 +178,16 @@ def test_a_shift_between_two_periods_is_no_clock(lost):
         assert FaultKind.CLOCKS not in kinds(report)
 
 
+@pytest.mark.parametrize("periods", [2, 3])
+def test_a_sample_lost_within_a_period_may_look_like_a_clock(periods):
+    rng, harmonics = np.random.default_rng(3), np.arange(60, 161)
+    samples = np.arange(periods * 2000)
+    turns = harmonics[:, None] * (samples + (samples >= 3000)) / 2000
+    u = np.cos(2 * np.pi * (turns + rng.random((harmonics.size, 1)))).sum(axis=0).reshape(periods, 2000)
+    report = find_faults(Spectrum.of(u, u), sample_rate_hz=5e3, harmonics=harmonics)
+    assert "or samples were lost" in only(report, FaultKind.CLOCKS, "actuator").text
+
+
 def test_few_lines_of_noise_are_hardly_ever_of_different_clocks():
     """The deviation of the slope is known from the phases of eight lines; six of it are no rarity then."""
     rng = np.random.default_rng(12)
