@@ -38,7 +38,9 @@ inner = njit(**OPTIONS)
 def entry(function: Callable) -> Callable:
     """A compiled function that Python calls.
 
-    It sees one kind of arrays, contiguous and writable, whatever it is given, so that it is compiled once.
+    It sees one kind of arrays, contiguous and writable, whatever it is given, so that it is compiled once. It
+    fills arrays and returns none: to return one numba calls Python, which then handles a Ctrl-C that came
+    meanwhile, and crashes.
     """
     kernel = inner(function)
     KERNELS.append(kernel)

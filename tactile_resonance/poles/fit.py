@@ -37,7 +37,9 @@ def minimise(
 ) -> Solution:
     """Minimise the cost of each point, from a start (points, M, n) or from Sanathanan-Koerner iterations."""
     begin = np.empty((0, data.records, sum(problem.sizes))) if start is None else start
-    return likelihood.minimise(problem.tables, data, begin, rules)
+    found = Solution.empty(len(data.y), data.records, begin.shape[2], data.driven)
+    likelihood.minimise(problem.tables, data, begin, rules, found)
+    return found
 
 
 def refit_failed(problem: Problem, solution: Solution, data: BinData) -> None:

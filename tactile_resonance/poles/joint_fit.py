@@ -250,14 +250,16 @@ def _without_rounding(plan: JointPlan, u: ComplexArray) -> ComplexArray:
     """
     if not plan.others_at.size:
         return u
+    # one bin of either kind tells most records that this is not about
+    other, line = (np.abs(u[:, 0, at[0]]) ** 2 for at in (plan.others_at, plan.excited_at))
+    rows = np.flatnonzero(other <= np.sqrt(ROUNDED) * line)
     between, driven = (
-        np.mean(u.real[..., at] ** 2 + u.imag[..., at] ** 2, axis=(1, 2))
-        for at in (plan.others_at, plan.excited_at)
+        np.mean(np.abs(u[rows][..., at]) ** 2, axis=(1, 2)) for at in (plan.others_at, plan.excited_at)
     )
-    exact = between <= ROUNDED * driven
-    if exact.any():
+    exact = rows[between <= ROUNDED * driven]
+    if exact.size:
         u = u.copy()
-        u[np.ix_(exact, np.ones(u.shape[1], bool), plan.others_at)] = 0.0
+        u[np.ix_(exact, np.arange(u.shape[1]), plan.others_at)] = 0.0
     return u
 
 

@@ -119,7 +119,7 @@ def most_missed(
         modes, inverse = _responses(part, plan.frequency_hz), solution.marginal[:, 0]
         none = np.zeros((plan.frequency_hz.size, 2), complex)
         of_fit = data, plan.problem.driven_bases, solution.theta, inverse, none, modes
-        fall = np.append(fall, _falls(*of_fit, solution.cost, np.ones(1))[0][0, 1:])
+        fall = np.append(fall, _all_falls(*of_fit, solution.cost, np.ones(1))[0][0, 1:])
     k, dof = int(np.argmax(fall)), data.lines[0] - solution.theta.size / 2
     return complex(tried[k]), float((dof - 1) * np.log1p(-fall[k] / solution.cost[0]) + np.log(tried.size))
 
@@ -186,7 +186,7 @@ class Lack:
         cost = solution.cost
         dof = data.records * (data.undriven + data.lines) - inverse.shape[-1] / 2  # (batch,)
         rest, modes = np.maximum(dof - 1, 0.5), directions.modes
-        fall, doubted, striking, taken, left = _falls(
+        fall, doubted, striking, taken, left = _all_falls(
             *(data, plan.problem.driven_bases, solution.theta, inverse, directions.numerator, modes),
             *(cost, 1 / rest),
         )
@@ -234,9 +234,30 @@ class Lack:
         return said
 
 
+def _all_falls(
+    data: BinData,
+    bases: tuple[ComplexArray, ComplexArray, ComplexArray],
+    theta: FloatArray,
+    inverse: FloatArray,
+    numerator: ComplexArray,
+    modes: FloatArray,
+    cost: FloatArray,
+    power_of_chance: FloatArray,
+) -> tuple[FloatArray, BoolArray, BoolArray, FloatArray, FloatArray]:
+    """What `_falls` finds, in its order."""
+    points, n = inverse.shape[:2]
+    falls, (doubted, asked) = np.empty((points, 1 + len(modes))), np.empty((2, points), bool)
+    taken, left = np.empty((points, 2, n)), np.empty((points, 2, 3))
+    found = falls, doubted, asked, taken, left
+    _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance, *found)
+    return found
+
+
 @entry
-def _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance):
-    """(points, 1 + N) what costs fall by with two residual terms more, or with each of N modes.
+def _falls(
+    data, bases, theta, inverse, numerator, modes, cost, power_of_chance, falls, doubted, asked, taken, left
+):
+    """Into (points, 1 + N) what costs fall by with two residual terms more, or with each of N modes.
 
     And where (points,) the first is rarer than `DOUBT`, and where one of them is rarer than `FALSE_ALARM`.
 
@@ -251,9 +272,7 @@ def _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance)
     a, b = basis_a.shape[1] - 1, basis_b.shape[1]
     own, slope, power = np.empty((n, 2, bins)), np.empty((2, bins)), np.empty(bins)
     pair, crossed, rest = np.empty((2, 2, bins)), np.empty((2, n)), np.empty((2, 3))
-    falls, same_y, same_u = np.empty((points, 1 + modes.shape[0])), data.variance_y, data.variance_u
-    taken, left, same_yu = np.empty((points, 2, n)), np.empty((points, 2, 3)), data.covariance_yu
-    doubted, asked = np.empty(points, np.bool_), np.empty(points, np.bool_)
+    same_y, same_u, same_yu = data.variance_y, data.variance_u, data.covariance_yu
     for point in range(points):
         same = min(point, data.u.shape[0] - 1)
         for k in range(bins):
@@ -306,7 +325,6 @@ def _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance)
             most = max(most, fall)
         doubted[point] = falls[point, 0] > (1 - DOUBT ** power_of_chance[point]) * cost[point]
         asked[point] = most > (1 - FALSE_ALARM ** power_of_chance[point]) * cost[point]
-    return falls, doubted, asked, taken, left
 
 
 @inner

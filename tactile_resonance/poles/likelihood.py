@@ -24,13 +24,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.poles.compiled import entry, inner
+
+if TYPE_CHECKING:
+    from tactile_resonance.poles.data import BinData
+    from tactile_resonance.poles.tables import Tables
 
 BLOCK = 48
 """Bins taken together: a multiple of the vectors of all processors, and few enough for the cache."""
@@ -146,6 +150,23 @@ class Solution(NamedTuple):
     leverage: FloatArray
     noise: FloatArray
     plain: BoolArray
+
+    @classmethod
+    def empty(cls, points: int, records: int, n: int, driven: int) -> Solution:
+        """Room for so many points, records, coefficients of each and driven bins."""
+        return cls(
+            np.empty((points, records, n)),
+            np.empty(points),
+            np.empty((points, 2)),
+            np.empty((points, records, driven), complex),
+            np.zeros(points, bool),
+            np.empty((points if records > 1 else 0, records, 2, n, n)),
+            np.empty((points, records, n, n)),
+            np.empty(points),
+            np.empty((points, 2)),
+            np.full((points, 2), np.nan),
+            np.ones(points, bool),
+        )
 
     def rows(self, which: npt.NDArray) -> Solution:
         """Some of the points."""
@@ -592,8 +613,9 @@ def _unpacked(gram, g, normal, point):
                     normal[point, m, part, i, j] = normal[point, m, part, j, i] = value
 
 
-@entry
-def moments(tables, data, theta):
+def moments(
+    tables: Tables, data: BinData, theta: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Cost, gradient and normal matrices of a batch, at theta (points, M, n) as in `Solution`.
 
     Returns
@@ -605,9 +627,17 @@ def moments(tables, data, theta):
     normal : (points, M, 2, n, n) float
     """
     points, records, n = theta.shape
-    work, which = _memory(tables, 1, records), np.zeros(1, np.int64)
     cost, gradient = np.empty((points, 2)), np.empty((points, records, n))
     normal = np.empty((points, records, 2, n, n))
+    _moments(tables, data, theta, cost, gradient, normal)
+    return cost, gradient, normal
+
+
+@entry
+def _moments(tables, data, theta, cost, gradient, normal):
+    """Put what `moments` gives into the last three."""
+    points, records, n = theta.shape
+    work, which = _memory(tables, 1, records), np.zeros(1, np.int64)
     for point in range(points):
         _load(data, point, work.values[0], work.power[0, 1])
         work.at[0, :, :n] = theta[point]
@@ -619,7 +649,6 @@ def moments(tables, data, theta):
             for i in range(n):
                 k = i * (n + 1) + n
                 gradient[point, m, i] = work.gram[0, m, 0, k] + work.gram[0, m, 1, k]
-    return cost, gradient, normal
 
 
 @inner
@@ -874,8 +903,7 @@ def _inverted(matrix, inverse, scale, row):
     return np.sqrt(condition)
 
 
-@entry
-def invert(matrices):
+def invert(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Inverses (batch, n, n) of positive definite matrices, and condition numbers of their roots.
 
     Returns
@@ -886,12 +914,18 @@ def invert(matrices):
         Root of the Frobenius condition number with unit diagonal: that of a Jacobian with unit columns,
         within a factor n. Infinite where there is no inverse.
     """
+    inverses, conditions = np.empty(matrices.shape), np.empty(len(matrices))
+    _invert(matrices, inverses, conditions)
+    return inverses, conditions
+
+
+@entry
+def _invert(matrices, inverses, conditions):
+    """Put what `invert` gives into the last two."""
     batch, n = matrices.shape[0], matrices.shape[1]
-    inverses, conditions = np.empty((batch, n, n)), np.empty(batch)
     scale, row = np.empty(n), np.empty(n)
     for k in range(batch):
         conditions[k] = _inverted(matrices[k], inverses[k], scale, row)
-    return inverses, conditions
 
 
 @inner
@@ -923,19 +957,14 @@ def _marginals(gram, g, c, whole, inverse, scale, row, marginal, leverage, point
 
 
 @entry
-def minimise(tables, data, start, rules):
-    """The `Solution` of least cost of each point.
+def minimise(tables, data, start, rules, found):
+    """Put the solution of least cost of each point into what `Solution.empty` made.
 
     From a start (points, M, n); where that is empty from two Sanathanan-Koerner iterations.
     """
     points, records = data.y.shape[:2]
     c, n = tables.c, tables.a + tables.b + tables.c
-    theta, cost, part_cost = np.empty((points, records, n)), np.empty(points), np.empty((points, 2))
-    residual = np.empty((points, records, tables.driven.bins), np.complex128)
-    converged, plain = np.zeros(points, np.bool_), np.ones(points, np.bool_)
-    normal = np.empty((points if records > 1 else 0, records, 2, n, n))
-    marginal, condition = np.empty((points, records, n, n)), np.empty(points)
-    leverage, noise = np.empty((points, 2)), np.full((points, 2), np.nan)
+    theta, cost, part_cost, residual, converged, normal, marginal, condition, leverage, noise, plain = found
     group, size = max(1, min(GROUP // records, points)), n + (records - 1) * c
     work, last_fall = _memory(tables, group, records), np.empty(group)
     whole, inverse, scale, row = np.empty((size, size)), np.empty((size, size)), np.empty(size), np.empty(size)
@@ -966,6 +995,3 @@ def minimise(tables, data, start, rules):
             )
             if records > 1:
                 _unpacked(work.gram, g, normal, point)
-    return Solution(
-        theta, cost, part_cost, residual, converged, normal, marginal, condition, leverage, noise, plain
-    )

@@ -87,7 +87,8 @@ class WeightedLines:
         taken = real_rows(sensitivity) @ solution.marginal[:, :, : sensitivity.shape[-1]]
         phase = np.empty(0) if plan._delay_phase is None else plan._delay_phase
         bases = (np.stack([of.real.T, of.imag.T]) for of in problem.driven_bases[:2])
-        ratio, squares = ratio_at_modes(taken, theta, *bases, phase, self.data, self.sample)
+        ratio, squares = np.empty((2, *taken.shape[:-1]))
+        ratio_at_modes(taken, theta, *bases, phase, self.data, self.sample, ratio, squares)
         each = known.dof if known.independent_dof is None else known.independent_dof
         return np.where(known.kind < 2, at_modes(ratio, each / squares), 1.0)
 
@@ -102,17 +103,16 @@ def _add_series(coefficients, basis, sums):
 
 
 @entry
-def ratio_at_modes(taken, theta, basis_a, basis_b, phase, data, sample):
+def ratio_at_modes(taken, theta, basis_a, basis_b, phase, data, sample, ratios, squares):
     """Of the lines that poles are known from, the mean ratio of a sample's variance to that of the data.
 
-    And the sum of the squares of their shares in the variance, both (points, places, 2) for the real and the
-    imaginary part. `taken` (points, places, 2, n) are the derivatives of these by the gradient of the cost, of
-    coefficients theta (points, n) over the bases (2, terms, K), real and imaginary part; `phase` (K,) is that
-    of a unit of delay, if there is one.
+    And the sum of the squares of their shares in the variance, into the last two (points, places, 2), for the
+    real and the imaginary part. `taken` (points, places, 2, n) are the derivatives of these by the gradient of
+    the cost, of coefficients theta (points, n) over the bases (2, terms, K), real and imaginary part; `phase`
+    (K,) is that of a unit of delay, if there is one.
     """
     points, places, _, n = taken.shape
     bins, a, b = basis_a.shape[2], basis_a.shape[1] - 1, basis_b.shape[1]
-    ratios, squares = np.empty((points, places, 2)), np.empty((points, places, 2))
     variance, ratio, weight, g = np.empty(bins), np.empty(bins), np.empty(bins), np.empty((2, bins))
     of_a, of_b, by_a, by_b = np.empty((2, bins)), np.empty((2, bins)), np.empty((2, bins)), np.empty((2, bins))
     for point in range(points):
@@ -163,7 +163,6 @@ def ratio_at_modes(taken, theta, basis_a, basis_b, phase, data, sample):
                     mean += share * ratio[k]
                     square += share * share
                 ratios[point, place, part], squares[point, place, part] = mean / total, square / (total * total)
-    return ratios, squares
 
 
 def lines_of_frf(frf: FRF) -> WeightedLines:

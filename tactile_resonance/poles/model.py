@@ -98,7 +98,9 @@ class PolynomialBasis:
         m = coefficients.shape[-1] - 1
         h = self.hessenberg[:m, :m]
         if m == 2:  # an eigenvalue solver costs more than the fit
-            return _two_roots(coefficients.reshape(-1, 3), self.hessenberg).reshape(*coefficients.shape[:-1], 2)
+            roots = np.empty((*coefficients.shape[:-1], 2), complex)
+            _two_roots(coefficients.reshape(-1, 3), self.hessenberg, roots.reshape(-1, 2))
+            return roots
         last = self.hessenberg[m, m - 1] * coefficients[..., :m] / coefficients[..., m:]
         comrade = np.broadcast_to(h, (*last.shape[:-1], m, m)).copy()
         comrade[..., :, -1] -= last
@@ -110,12 +112,11 @@ class PolynomialBasis:
 
 
 @entry
-def _two_roots(coefficients, h):
-    """(points, 2) roots of (points, 3) coefficients; see `PolynomialBasis.roots`.
+def _two_roots(coefficients, h, roots):
+    """Put roots (points, 2) of coefficients (points, 3) into the last; see `PolynomialBasis.roots`.
 
     In closed form; of complex ones that above the real axis comes first.
     """
-    roots = np.empty((coefficients.shape[0], 2), np.complex128)
     for point in range(coefficients.shape[0]):
         scale = h[2, 1] / coefficients[point, 2]
         first, second = h[0, 0], h[1, 1] - scale * coefficients[point, 1]
@@ -129,7 +130,6 @@ def _two_roots(coefficients, h):
             large = half - np.sqrt(under) if half < 0 else half + np.sqrt(under)
             roots[point, 0] = large
             roots[point, 1] = 0.0 if large == 0 else (first * second - beside * h[1, 0]) / large
-    return roots
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,13 +237,14 @@ class RationalModel:
         x = self.variable.of_s(poles_rad_s)
         points = math.prod(x.shape[:-1])
         arrays = (x, self.variable.to_s(x)[1], self.denominator, self.numerator)
-        residues, sensitivity = _residues_and_sensitivity(
-            *(array.reshape(points, array.shape[-1]) for array in arrays),
-            self.denominator_basis.hessenberg,
-            self.numerator_basis.hessenberg,
+        hessenberg = self.denominator_basis.hessenberg, self.numerator_basis.hessenberg
+        k, n = x.shape[-1], hessenberg[0].shape[1]
+        residues, sensitivity = np.empty((points, k), complex), np.empty((points, k, n), complex)
+        _residues_and_sensitivity(
+            *(array.reshape(points, array.shape[-1]) for array in arrays), *hessenberg, residues, sensitivity
         )
         turned = residues.reshape(x.shape) * self._turn(poles_rad_s)
-        return turned, sensitivity.reshape(*x.shape, sensitivity.shape[-1])
+        return turned, sensitivity.reshape(*x.shape, n)
 
     def _turn(self, poles_rad_s: ComplexArray) -> ComplexArray | float:
         """(..., k) what the delay makes of residues at poles (..., k)."""
@@ -295,11 +296,11 @@ class RationalModel:
 
 
 @entry
-def _residues_and_sensitivity(x, ds_dx, denominator, numerator, hessenberg_a, hessenberg_b):
-    """Of models (points, terms) at their poles x (points, k), (points, k) and (points, k, n)."""
+def _residues_and_sensitivity(
+    x, ds_dx, denominator, numerator, hessenberg_a, hessenberg_b, residues, sensitivity
+):
+    """Of models (points, terms) at their poles x (points, k), into the last, (points, k) and (points, k, n)."""
     (points, count), n, terms = x.shape, hessenberg_a.shape[1], hessenberg_b.shape[1] + 1
-    residues = np.empty((points, count), np.complex128)
-    sensitivity = np.empty((points, count, n), np.complex128)
     value, slope = np.empty(max(n + 1, terms), np.complex128), np.empty(n + 1, np.complex128)
     for point in range(points):
         for k in range(count):
@@ -324,7 +325,6 @@ def _residues_and_sensitivity(x, ds_dx, denominator, numerator, hessenberg_a, he
                 value[i + 1] = new / hessenberg_b[i + 1, i]
                 above += value[i + 1] * numerator[point, i + 1]
             residues[point, k] = above * factor
-    return residues, sensitivity
 
 
 def real_covariance(sensitivity: ComplexArray, parameters: FloatArray) -> FloatArray:

@@ -103,16 +103,17 @@ def _best_level(residual: ComplexArray, parameters: int) -> tuple[FloatArray, in
     if lines < 3:
         return np.full(residual.shape[:-1], np.nan), 1
     counts, cosines = _components(lines, parameters)
-    scores = _scores(np.asarray(residual, complex).reshape(-1, lines), counts, cosines)
+    scores = np.empty(residual.size // lines)
+    _scores(np.asarray(residual, complex).reshape(-1, lines), counts, cosines, scores)
     return scores.reshape(residual.shape[:-1]), counts.size
 
 
 @entry
-def _scores(residual, counts, cosines):
-    """(points,) score of residuals (points, F) for numbers of cosines (levels,), of cosines (J, F)."""
+def _scores(residual, counts, cosines, scores):
+    """Put scores (points,) of residuals (points, F), for numbers (levels,) of cosines (J, F), into the last."""
     points, lines = residual.shape
     filled = cosines.shape[1]
-    re, im, scores = np.zeros(filled), np.zeros(filled), np.empty(points)
+    re, im = np.zeros(filled), np.zeros(filled)
     for point in range(points):
         total, used = 0.0, 0
         for k in range(lines):
@@ -135,7 +136,6 @@ def _scores(residual, counts, cosines):
             score = ((1 - b) * root - (1 - a)) / np.sqrt(b * root * root + a)
             best = score if not score <= best else best  # not a number where the first one is none
         scores[point] = best
-    return scores
 
 
 def systematic_of(

@@ -33,15 +33,17 @@ def modes_in_band(poles_rad_s: ComplexArray, band_hz: tuple[float, float]) -> Co
     """
     margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
     n = poles_rad_s.shape[-1]
-    poles = _in_band(poles_rad_s.reshape(-1, n), band_hz[0] - margin, band_hz[1] + margin)
-    return poles.reshape(*poles_rad_s.shape[:-1], n // 2)
+    found = np.full((*poles_rad_s.shape[:-1], n // 2), complex(np.nan, np.nan))
+    ends_hz = band_hz[0] - margin, band_hz[1] + margin
+    _in_band(poles_rad_s.reshape(-1, n), *ends_hz, found.reshape(-1, n // 2))
+    return found
 
 
 @entry
-def _in_band(poles, low_hz, high_hz):
-    """(points, n // 2) of poles (points, n) those above the real axis in a band, by natural frequency."""
+def _in_band(poles, low_hz, high_hz, found):
+    """Of poles (points, n) those above the real axis in a band, by natural frequency, into (points, n // 2)."""
     points, n = poles.shape
-    found, f0_hz = np.full((points, n // 2), complex(np.nan, np.nan)), np.empty(n // 2)
+    f0_hz = np.empty(n // 2)
     for point in range(points):
         count = 0
         for pole in poles[point]:
@@ -53,17 +55,24 @@ def _in_band(poles, low_hz, high_hz):
                     k -= 1
                 f0_hz[k], found[point, k] = size_hz, pole
                 count += 1
-    return found
 
 
-@entry
-def propagated(poles, sensitivity, parameters):
+def propagated(
+    poles: ComplexArray, sensitivity: ComplexArray, parameters: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Covariances (points, k, 2, 2) of (Re, Im) of poles (points, k), and of (f0_hz, damping_ratio).
 
     From derivatives of the poles (points, k, p) by the first p coefficients, of covariance (points, n, n).
     """
+    of_poles, in_f0 = np.empty((2, *poles.shape, 2, 2))
+    _propagate(poles, sensitivity, parameters, of_poles, in_f0)
+    return of_poles, in_f0
+
+
+@entry
+def _propagate(poles, sensitivity, parameters, of_poles, in_f0):
+    """Put what `propagated` gives into the last two."""
     points, count, p = sensitivity.shape
-    of_poles, in_f0 = np.empty((points, count, 2, 2)), np.empty((points, count, 2, 2))
     for point in range(points):
         for k in range(count):
             rr = ri = ii = 0.0
@@ -88,7 +97,6 @@ def propagated(poles, sensitivity, parameters):
             in_f0[point, k, 1, 1] = c * c * rr + 2 * c * d * ri + d * d * ii
             both = a * c * rr + (a * d + b * c) * ri + b * d * ii
             in_f0[point, k, 0, 1] = in_f0[point, k, 1, 0] = both
-    return of_poles, in_f0
 
 
 def pole_quantities(

@@ -206,18 +206,19 @@ def model_variance(variance: FloatArray, dof: int, gain: FloatArray | None = Non
     channels = 1 if gain is None else 2
     limits = (_flat_limits(variance.shape[1], dof, n) for n in (channels, 2))
     gain = np.empty((len(variance), 0)) if gain is None else gain
-    model, kind, lines = _modelled(np.asarray(variance, float), gain, *limits)
+    model = np.empty(variance.shape)
+    kind, lines = np.zeros((2, len(variance)), np.int64)
+    _modelled(np.asarray(variance, float), gain, *limits, model, kind, lines)
     return VarianceModel(model, lines, dof, kind)
 
 
 @entry
-def _modelled(variance, gain, flat, sloped):
-    """Variances (points, F) to weight with, their kinds, and how many lines are used.
+def _modelled(variance, gain, flat, sloped, model, kind, used):
+    """Put variances (points, F) to weight with, their kinds, and how many lines are used into the last three.
 
     `flat`, `sloped` (F + 1,): limits of the tests for so many lines.
     """
     points, lines = variance.shape
-    model, kind, used = np.empty((points, lines)), np.zeros(points, np.int64), np.zeros(points, np.int64)
     usable, sample = np.empty(lines), np.empty(lines)
     for point in range(points):
         total = 0.0
@@ -240,7 +241,6 @@ def _modelled(variance, gain, flat, sloped):
         for k in range(lines):
             if usable[k] == 0:
                 model[point, k] = np.inf
-    return model, kind, used
 
 
 @inner
@@ -325,22 +325,28 @@ def _fit_slope(sample, usable, model):
         model[k] = np.exp(c0 + c1 * (2 * k / (lines - 1) - 1))
 
 
-@entry
-def two_channels(variance, gain, sloped):
+def two_channels(variance: FloatArray, gain: FloatArray, sloped: BoolArray) -> FloatArray:
     """(batch, F) fit of ``a + b gain``, neither negative, to gamma distributed variances.
 
     Where `sloped` (batch,) times ``exp(c_0 + c_1 x)``, fitted first. Iteratively reweighted least squares, or
     Fisher scoring, is maximum likelihood here: the variance of a gamma variable is proportional to its squared
     mean.
     """
-    model, usable, curve = np.empty_like(variance), np.ones(variance.shape[1]), np.ones(variance.shape[1])
+    model = np.empty(variance.shape)
+    _two_channels(variance, gain, sloped, model)
+    return model
+
+
+@entry
+def _two_channels(variance, gain, sloped, model):
+    """Put what `two_channels` gives into the last."""
+    usable, curve = np.ones(variance.shape[1]), np.ones(variance.shape[1])
     for point in range(variance.shape[0]):
         curve[:] = 1.0
         if sloped[point]:
             _fit_slope(variance[point], usable, curve)
         _add_channels(variance[point] / curve, gain[point], usable, model[point])
         model[point] *= curve
-    return model
 
 
 def line_pieces(lines: int, dof: int) -> Pieces:

@@ -35,7 +35,8 @@ def test_lines_count_as_the_response_there_moves_poles(delay, correlated):
 
     data, sample = (weighted(rng.uniform(3.0, 5.0, (1, BINS))) for _ in range(2))
     bases = (np.stack([of.real.T, of.imag.T]) for of in (basis_a, basis_b))
-    ratio, squares = ratio_at_modes(taken, theta, *bases, phase, data, sample)
+    ratio, squares = np.empty((2, *taken.shape[:-1]))
+    ratio_at_modes(taken, theta, *bases, phase, data, sample, ratio, squares)
     g, step = response(theta[0]), 1e-6
     slope = np.array(
         [(response(theta[0] + d) - response(theta[0] - d)) / (2 * step) for d in step * np.eye(theta.size)]
