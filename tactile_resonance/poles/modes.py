@@ -33,10 +33,10 @@ def modes_in_band(poles_rad_s: ComplexArray, band_hz: tuple[float, float]) -> Co
     """
     margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
     n = poles_rad_s.shape[-1]
-    found = np.full((*poles_rad_s.shape[:-1], n // 2), complex(np.nan, np.nan))
-    ends_hz = band_hz[0] - margin, band_hz[1] + margin
-    _in_band(poles_rad_s.reshape(-1, n), *ends_hz, found.reshape(-1, n // 2))
-    return found
+    poles = poles_rad_s.reshape(-1, n)
+    found = np.full((len(poles), n // 2), complex(np.nan, np.nan))
+    _in_band(poles, band_hz[0] - margin, band_hz[1] + margin, found)
+    return found.reshape(*poles_rad_s.shape[:-1], n // 2)
 
 
 @entry
