@@ -230,6 +230,9 @@ def _result(
 ) -> Fit:
     """Fit of the solution chosen; `further` has one term more."""
     means, ball, n = problem.means, problem.ball, best.terms
+    force, ball_m = problem.course(best.x[None])
+    peak, held = float(force[0].max()), float(force[0, means.turn])
+    require(peak > 0, "force_n", "forces that fit best without a contact", "those of tissue that stays")
     count = means.time_s.size
     dof = max(1, count - best.x.size)
     covariance, walk_n_per_sqrt_s = problem.covariance(best)
@@ -254,12 +257,9 @@ def _result(
         for t in terms
     ):
         equilibrium = Known.SLOWER
-    force, ball_m = problem.course(best.x[None])
     surface, zero, drift = best.x[-3:]
     measured = means.force_n - zero - drift * (means.time_s - means.begin_s)
     deepest = float(ball_m[0, : means.turn + 1].max())
-    peak, held = float(force[0].max()), float(force[0, means.turn])
-    require(peak > 0, "force_n", "forces that fit best without a contact", "those of tissue that stays")
     sphere = sphere_share(ball, deepest)
     layer = np.nan if np.isnan(thickness_m) else layer_share(ball, deepest, thickness_m)
     ratio = float(np.sqrt(deepest / ball.radius_m))
