@@ -212,9 +212,9 @@ def with_noise(
     transient = gamma @ problem.transient[: data.undriven].T / of_a[:, None]
     error = _bin_by_bin(data.y[..., others] - transient)  # (points, K_o M)
     u = _bin_by_bin(np.broadcast_to(data.u, data.y.shape)[..., others])
-    response = beta[:, 0] @ plan.numerator_on_bins[plan.others_at].T / of_a
+    response = (beta[:, 0] @ plan.numerator_on_bins[plan.others_at].T / of_a).repeat(records, axis=1)
     power_error, power_u, cross, correlated = _powers(error, u)
-    by_g, gain = response.repeat(records, axis=1) * u, cross / np.maximum(power_u, TINY)
+    by_g, gain = response * u, cross / np.maximum(power_u, TINY)
     rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
     # over a mode the phase of the response turns; few bins count there, and a drift is on the same ones
     seen = correlated | (_powers(error, by_g)[3] & (rest_g < power_error / 2))
@@ -226,12 +226,12 @@ def with_noise(
     pieces = _pieces_between(data.undriven, records)
     total_power, _ = _by_piece(error, pieces, free)
     # of an input that is known but for the noise of its voltmeter, which comes in through the response
-    of_u = np.where(generator, _power(response.repeat(records, axis=1)), 0.0)
-    rest_power, kind_rest = _by_piece(rest, pieces, free, of_u if generator.any() else None)
+    of_u = np.where(generator, _power(response), 0.0) if generator.any() else None
+    rest_power, kind_rest = _by_piece(rest, pieces, free, of_u)
     input_power, kind_u = _by_piece(u, pieces, 1.0)
     measured = np.where(common, total_power, rest_power)
     variance_u = np.where(generator, 0.0, input_power)
-    if seen.any():
+    if (generator | common).any():
         y = data.y.copy()
         y[..., others] -= through.reshape(len(y), -1, records).swapaxes(1, 2)
         data = data._replace(y=y)
@@ -284,17 +284,19 @@ def _by_piece(
 ) -> tuple[FloatArray, IntArray]:
     """(batch, 1) or (batch, pieces) variance, and its kind as index into `KINDS`.
 
-    Flat unless a test says otherwise; ``a + b gain`` where a gain is given, of each value.
+    Flat unless a test says otherwise; ``a + b gain`` of points with a gain of each value that is not 0.
     """
     mean = _mean_power(values) * factor
     samples = pieces.means(_power(values))
     if pieces.starts.size < FEWEST_PIECES or (gain is None and bool(are_flat(samples, pieces.dof).all())):
         return mean, np.zeros(mean.shape[0], np.int64)
-    model = model_variance(samples * factor, pieces.dof, None if gain is None else pieces.means(gain))
-    flat = model.kind[:, None] == 0
+    model = model_variance(samples * factor, pieces.dof)
+    variance, kind = np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
     if gain is not None:
-        flat &= ~gain.any(axis=1, keepdims=True)
-    return np.where(flat, mean, model.variance), model.kind
+        rows = gain.any(axis=1)
+        both = model_variance(samples[rows] * factor, pieces.dof, pieces.means(gain[rows]))
+        variance[rows], kind[rows] = both.variance, both.kind
+    return variance, kind
 
 
 def _power(values: ComplexArray) -> FloatArray:

@@ -12,7 +12,9 @@ from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.result import FrfStatus, band_bins
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.poles import estimator
+from tactile_resonance.poles.data import BinData, with_noise
 from tactile_resonance.poles.estimator import identify_poles_from_records
+from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
@@ -115,6 +117,24 @@ def test_clocks_that_differ_change_no_mode(apart):
     assert stats.chi2.sf(sum(distance(poles) for poles in found), 24) > 1e-3
     bound_hz = 1.17e-3  # deviation of f0 from the same noise with one clock
     assert all(poles.main.std[0] < 2 * bound_hz for poles in found)
+
+
+def test_a_disturbed_record_changes_the_noise_of_no_other_one_of_a_batch():
+    """Of a hundred whose noise is so sloped that the test for it finds some of them flat."""
+    plan = JointPlan(RATE_HZ, SAMPLES, 4, ODD, BAND_HZ, ModelStructure())
+    records = [record(seed, kind="white", voltmeter_u=1e-9, periods=4) for seed in range(100)]
+    records.append(record(100, kind="white", generator=0.03, voltmeter_u=3e-3, periods=4))
+    u, y = (np.fft.rfft(x.reshape(len(x), -1))[:, None, plan.bins] for x in np.swapaxes(records, 0, 1))
+    g = np.linspace(-1, 1, plan.bins.size) * np.linspace(0.6, 0, len(y))[:, None, None]
+    noise = np.random.default_rng(0).standard_normal((*y.shape, 2)).view(complex)[..., 0]
+    data = BinData.of(y + 0.3 * (1 + g) * noise, u, plan.order, plan.others_at.size)
+    theta = minimise(plan.problem, data).theta
+    weighted, _, kind = with_noise(plan, data, theta)
+    alone, _, same = with_noise(plan, data.rows(slice(100)), theta[:100])
+    assert kind[100] == 0
+    assert set(kind) == {0, 1}
+    assert np.array_equal(kind[:100], same)
+    assert weighted.variance[:100] == pytest.approx(alone.variance)
 
 
 @pytest.mark.parametrize("kind", ["white", "narrow"])
