@@ -216,12 +216,13 @@ def half_inverse(matrices: FloatArray) -> FloatArray:
     H and ``H^T`` first, where it is about a unit matrix: else what is small beside the largest variance is lost
     to rounding.
     """
-    half = np.full(matrices.shape, np.nan)
-    for k, matrix in enumerate(matrices):
-        scale = 1 / np.sqrt(np.diagonal(matrix))
-        with suppress(np.linalg.LinAlgError):
-            half[k] = np.linalg.inv(np.linalg.cholesky(matrix * np.outer(scale, scale))) * scale
-    return half
+    scale = 1 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))[:, None]  # (batch, 1, n)
+    with suppress(np.linalg.LinAlgError):
+        return np.linalg.inv(np.linalg.cholesky(matrices * (scale * scale.swapaxes(1, 2)))) * scale
+    if len(matrices) == 1:
+        return np.full(matrices.shape, np.nan)
+    # one fails all: it is looked for by halves
+    return np.concatenate([half_inverse(part) for part in np.array_split(matrices, 2)])
 
 
 def sandwich(half: FloatArray, middle: FloatArray) -> FloatArray:
