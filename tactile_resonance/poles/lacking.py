@@ -113,13 +113,12 @@ def most_missed(
     plan: FitPlan, data: BinData, solution: Solution, tried: ComplexArray
 ) -> tuple[complex, float]:
     """Of modes (N,) the one that a fit of one point lacks most, and the logarithm of its chance in noise."""
-    fall = np.empty(0)
+    no_terms = np.zeros((plan.frequency_hz.size, 2), complex)
+    of_fit = data, plan.problem.driven_bases, solution.theta, solution.marginal[:, 0], no_terms
     # not all at once: those tried are about as many as lines
-    for part in np.array_split(tried, -(-tried.size // TRIED_AT_ONCE)):
-        modes, inverse = _responses(part, plan.frequency_hz), solution.marginal[:, 0]
-        none = np.zeros((plan.frequency_hz.size, 2), complex)
-        of_fit = data, plan.problem.driven_bases, solution.theta, inverse, none, modes
-        fall = np.append(fall, _all_falls(*of_fit, solution.cost, np.ones(1))[0][0, 1:])
+    parts = np.array_split(tried, -(-tried.size // TRIED_AT_ONCE))
+    modes = (_responses(part, plan.frequency_hz) for part in parts)
+    fall = np.concatenate([_all_falls(*of_fit, each)[0][0, 1:] for each in modes])
     k, dof = int(np.argmax(fall)), data.lines[0] - solution.theta.size / 2
     return complex(tried[k]), float((dof - 1) * np.log1p(-fall[k] / solution.cost[0]) + np.log(tried.size))
 
@@ -186,10 +185,11 @@ class Lack:
         cost = solution.cost
         dof = data.records * (data.undriven + data.lines) - inverse.shape[-1] / 2  # (batch,)
         rest, modes = np.maximum(dof - 1, 0.5), directions.modes
-        fall, doubted, striking, taken, left = _all_falls(
-            *(data, plan.problem.driven_bases, solution.theta, inverse, directions.numerator, modes),
-            *(cost, 1 / rest),
+        fall, taken, left = _all_falls(
+            data, plan.problem.driven_bases, solution.theta, inverse, directions.numerator, modes
         )
+        doubted = fall[:, 0] > (1 - DOUBT ** (1 / rest)) * cost
+        striking = fall.max(axis=1) > (1 - FALSE_ALARM ** (1 / rest)) * cost
         enough = dof > FEWEST_DOF
         for k in (striking & enough).nonzero()[0]:
             level = np.maximum((cost[k] - fall[k]) / rest[k], known[k])
@@ -241,25 +241,17 @@ def _all_falls(
     inverse: FloatArray,
     numerator: ComplexArray,
     modes: FloatArray,
-    cost: FloatArray,
-    power_of_chance: FloatArray,
-) -> tuple[FloatArray, BoolArray, BoolArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What `_falls` finds, in its order."""
     points, n = inverse.shape[:2]
-    falls, (doubted, asked) = np.empty((points, 1 + len(modes))), np.empty((2, points), bool)
-    taken, left = np.empty((points, 2, n)), np.empty((points, 2, 3))
-    found = falls, doubted, asked, taken, left
-    _falls(data, bases, theta, inverse, numerator, modes, cost, power_of_chance, *found)
+    found = np.empty((points, 1 + len(modes))), np.empty((points, 2, n)), np.empty((points, 2, 3))
+    _falls(data, bases, theta, inverse, numerator, modes, *found)
     return found
 
 
 @entry
-def _falls(
-    data, bases, theta, inverse, numerator, modes, cost, power_of_chance, falls, doubted, asked, taken, left
-):
+def _falls(data, bases, theta, inverse, numerator, modes, falls, taken, left):
     """Into (points, 1 + N) what costs fall by with two residual terms more, or with each of N modes.
-
-    And where (points,) the first is rarer than `DOUBT`, and where one of them is rarer than `FALSE_ALARM`.
 
     Of fitted points, theta (points, M, s + c), with `bases` of A, B and C on driven bins and the `inverse`
     (points, n, n) of the normal matrix of all n = s + M c coefficients. 0 where these have taken a direction
@@ -318,13 +310,8 @@ def _falls(
                 pair[r, 0, k], pair[r, 1, k] = value.real, value.imag
         falls[point, 0] = _fall(pair, own, slope, power, inverse[point], crossed, rest)
         taken[point], left[point] = crossed, rest
-        most = falls[point, 0]
         for m in range(modes.shape[0]):
-            fall = _fall(modes[m], own, slope, power, inverse[point], crossed, rest)
-            falls[point, 1 + m] = fall
-            most = max(most, fall)
-        doubted[point] = falls[point, 0] > (1 - DOUBT ** power_of_chance[point]) * cost[point]
-        asked[point] = most > (1 - FALSE_ALARM ** power_of_chance[point]) * cost[point]
+            falls[point, 1 + m] = _fall(modes[m], own, slope, power, inverse[point], crossed, rest)
 
 
 @inner
