@@ -333,8 +333,8 @@ def _by_others(
     """(n, K) probabilities of groups, each group as the other points (n, 2) show it.
 
     Its mean is as uncertain as these leave it, with a wide distribution about all points before them.
-    Deviations are Student's, with the degrees of freedom `of_all` groups' one covariance; None: that of each
-    group has one for each of its points.
+    Deviations are Student's, with `of_all` degrees of freedom where groups share a covariance, else with one
+    for each point of a group.
     A point that had a say in the mean it is compared with would be nearer to it than a new one.
     """
     total = noise[:, None] + covariance

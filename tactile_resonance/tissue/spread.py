@@ -269,13 +269,14 @@ def _degrees_of_freedom(
 def within_preparation(tissues: Iterable[Sequence[SpreadSource]]) -> tuple[FloatArray, float]:
     """(2, 2) spread of points of one preparation, mean over the tissues, and its degrees of freedom.
 
-    It is that by position and repetition. Degrees of freedom are those of positions, the fewer, of tissues that
-    scatter alike; of sources that are pooled, which all have, those of one.
+    It is the sum of those by position and by repetition. Degrees of freedom are those of positions, the fewer,
+    as of tissues that scatter alike; sources that tissues share, as pooled ones are, count once.
 
     Raises
     ------
     ValueError
-        If that of positions is not determined of a tissue: repetitions at one place do not show it.
+        If that of positions is not determined of a tissue, for repetitions at one place do not show it, or is
+        by one degree of freedom in all.
     """
     found, degrees = [], {}
     for sources in tissues:
@@ -285,7 +286,9 @@ def within_preparation(tissues: Iterable[Sequence[SpreadSource]]) -> tuple[Float
         found.append(np.sum([s.covariance for s in inner.values()], axis=0))
         degrees[found[-1].tobytes()] = inner["position"].degrees_of_freedom
     each = np.array([*degrees.values()])
-    return np.mean(found, axis=0), float(len(each) ** 2 / np.sum(1 / each))
+    total = float(len(each) ** 2 / np.sum(1 / each))
+    require(total > 1, "spread", f"{total:g} degree of freedom of positions", "more than 1")
+    return np.mean(found, axis=0), total
 
 
 def not_negative(matrix: FloatArray, scale: FloatArray) -> FloatArray:

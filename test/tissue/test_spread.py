@@ -178,6 +178,9 @@ def test_repetitions_at_one_place_do_not_show_how_points_of_a_map_scatter():
     (spread,) = spreads_of(drawn(np.random.default_rng(11), [(3,)] * 6))
     with pytest.raises(ValueError, match=r"spread: got \['repetition'\]; accepted is position among them"):
         within_preparation([spread.sources])
+    (spread,) = spreads_of(drawn(np.random.default_rng(11), [(1, 1)]))
+    with pytest.raises(ValueError, match=r"spread: got '1 degree of freedom of positions'; accepted is more"):
+        within_preparation([spread.sources])
 
 
 def test_nearest_covariance():
