@@ -154,6 +154,7 @@ def test_a_way_that_goes_back_is_refused():
         fit_indentation(replace(test, depth_m=depth))
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
