@@ -216,8 +216,8 @@ def with_noise(
     power_error, power_u, cross, correlated = _powers(error, u)
     by_g, gain = response * u, cross / np.maximum(power_u, TINY)
     rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
-    # over a mode the phase of the response turns; few bins count there, and a drift is on the same ones
-    seen = correlated | (_powers(error, by_g)[3] & (rest_g < power_error / 2))
+    # over a mode the phase of the response turns; its size would let the few bins of a peak decide
+    seen = correlated | _powers(error, by_g / np.maximum(np.abs(response), TINY))[3]
     generator = seen & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
     common = correlated & ~generator
     through = np.where(generator, by_g, np.where(common, gain * u, 0.0))
