@@ -112,7 +112,7 @@ MOST_NAMED = 12
 DRIVEN = 100
 """Power at excited lines over that between them, above which a record was not taken without drive."""
 EXACT = 1e-28
-"""Power of a tone over that of the signal: what is smaller double precision makes."""
+"""Power of a tone over that of the signal, below which it is rounding."""
 
 
 @dataclass(frozen=True)

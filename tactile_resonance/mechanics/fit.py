@@ -36,8 +36,8 @@ from tactile_resonance.mechanics.prony import Prony
 
 MOST_TERMS = 4
 SHOWN, SURE = 2.5, 2.0
-"""A hold shows a term where it lasts so many of its time constants: with less, one term passes for two. By so
-many deviations. A term of so many holds may hide in Einf."""
+"""A hold of `SHOWN` time constants of a term shows it, by `SURE` deviations: in less, one term passes for two.
+A term with a time constant of `SHOWN` holds may hide in Einf."""
 LARGEST_STD = 0.3
 """Relative deviation beyond which a constant is not determined."""
 SIGNIFICANT = 0.05

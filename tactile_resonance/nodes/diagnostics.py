@@ -74,11 +74,10 @@ class Health:
 
     def _publish(self) -> None:
         now_s, state = time.monotonic(), self._node.state_name()
-        message, levels = state, (DiagnosticStatus.OK, DiagnosticStatus.WARN)
-        if now_s - self._error_s < ERROR_REMEMBERED_S:
-            message = f"{state}: {self._error}"
-            levels = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-        level = levels[state != "active"]
+        recent = now_s - self._error_s < ERROR_REMEMBERED_S
+        message = f"{state}: {self._error}" if recent else state
+        levels = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+        level = levels[recent + (state != "active")]
         values = {"state": state}
         for topic, flow in self._flows.items():
             rate_hz = len(flow.took_s) / (now_s - self._reported_s)

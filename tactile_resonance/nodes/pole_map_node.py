@@ -263,7 +263,7 @@ class PoleMapNode(ManagedNode):
         self.health.error(reason)
 
     def _on_parameters(self, _: Sequence[RosParameter]) -> None:
-        """Draw anew: what is not fixed says how, and one output must not state what another does not show."""
+        """Draw anew: parameters that are not fixed say how, and the legend states them."""
         self._renew()
 
     def _clear(self) -> str:

@@ -250,7 +250,7 @@ def _without_rounding(plan: JointPlan, u: ComplexArray) -> ComplexArray:
     """
     if not plan.others_at.size:
         return u
-    # one bin of either kind tells most records that this is not about
+    # one bin of either kind rules most records out
     other, line = (np.abs(u[:, 0, at[0]]) ** 2 for at in (plan.others_at, plan.excited_at))
     rows = np.flatnonzero(other <= np.sqrt(ROUNDED) * line)
     between, driven = (

@@ -66,7 +66,7 @@ def level_of(
     cost, expected, suspect, noise
         See `judgement.Judged`.
     correction : (batch,) float
-        Factor of the covariance for a level that is not known exactly, and for what it does not count.
+        Factor of the covariance for a level that is not known exactly, and for noise on excited lines alone.
     """
     batch, _, n = solution.theta.shape
     lines, others = plan.excited_at.size, plan.others_at.size

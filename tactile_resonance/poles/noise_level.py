@@ -130,10 +130,9 @@ class VarianceModel:
         chance = special.fdtrc(2 * free, 2 * self.pooled_dof, cost / free)
         by_line = self.kind == 2
         if by_line.any():
-            chance[by_line] = np.nan
-            if self.dof > 2:
-                ratio = cost / self.expected_cost(parameters)
-                chance = np.where(by_line, chance_of_pieces(ratio, free, 1, self.dof), chance)
+            ratio = cost / self.expected_cost(parameters)
+            of_lines = chance_of_pieces(ratio, free, 1, self.dof) if self.dof > 2 else np.nan
+            chance = np.where(by_line, of_lines, chance)
         return np.asarray(chance)
 
 

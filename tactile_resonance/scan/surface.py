@@ -362,7 +362,7 @@ def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface
 
 
 def with_file_beside(fields: object, folder: Path) -> tuple[Any, Path | None]:
-    """A scene's section ``surface`` as a run has it, its file beside the scene; and that file, None: none."""
+    """Section ``surface`` of a scene as it stands in a run, and the file that it names, or None."""
     for form, value in fields.items() if isinstance(fields, Mapping) else ():
         if isinstance(value, Mapping) and isinstance(value.get("file"), str):
             path = folder / value["file"]
