@@ -101,12 +101,11 @@ def poles_tried(frequency_hz: FloatArray) -> ComplexArray:
 
 def _responses(poles_rad_s: ComplexArray, frequency_hz: FloatArray) -> FloatArray:
     """(N, 2, 2, K) of modes with residues 1 and j, over their width, real and imaginary parts."""
-    s = 2j * np.pi * frequency_hz[:, None]
-    above, below = 1 / (s - poles_rad_s), 1 / (s - poles_rad_s.conj())
-    phi = np.stack([above + below, 1j * (above - below)], axis=-1)  # (K, N, 2)
-    phi *= np.abs(poles_rad_s.real)[:, None]
-    phi = phi.transpose(1, 2, 0)
-    return np.ascontiguousarray(np.stack([phi.real, phi.imag], axis=2))
+    s, pole = 2j * np.pi * frequency_hz, poles_rad_s[:, None]
+    above, below = 1 / (s - pole), 1 / (s - pole.conj())
+    one, other = ((above + factor * below) * np.abs(pole.real) for factor in (1, -1))  # the other over j
+    parts = [one.real, one.imag, -other.imag, other.real]
+    return np.stack(parts, axis=1).reshape(pole.size, 2, 2, s.size)
 
 
 def most_missed(
