@@ -253,6 +253,8 @@ def _without_rounding(plan: JointPlan, u: ComplexArray) -> ComplexArray:
     # one bin of either kind rules most records out
     other, line = (np.abs(u[:, 0, at[0]]) ** 2 for at in (plan.others_at, plan.excited_at))
     rows = np.flatnonzero(other <= np.sqrt(ROUNDED) * line)
+    if not rows.size:
+        return u
     between, driven = (
         np.mean(np.abs(u[rows][..., at]) ** 2, axis=(1, 2)) for at in (plan.others_at, plan.excited_at)
     )
