@@ -25,7 +25,7 @@ from tactile_resonance.scan.table_calibration import (
 )
 
 AT_ONCE_S = 1.0
-"""Of goals that are rejected within this, as those of two clients, each reason is told [s]."""
+"""Goals rejected within this time of each other may be of two clients: the reasons of all are reported [s]."""
 OF_ANOTHER = "; of another goal at that time: "
 RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 

@@ -296,11 +296,8 @@ def _fit(
     judged = judge(_Round(plan, plain, data, solution, noise, np.zeros(len(y), np.int64)))
     others = np.flatnonzero(~solution.plain)
     if others.size:
-        data, theta = plain.rows(others), solution.theta[others]
-        if plain.records == 1:  # until now the transient was fitted with what comes through the input as noise
-            first = _Round.weighted_with_noise(plan, data, theta).solution
-            theta = np.where(_may_return(first)[:, None, None], first.theta, theta)
-        judged.put(others, judge(_Round.weighted_with_noise(plan, data, theta)))
+        theta = solution.theta[others]
+        judged.put(others, judge(_Round.weighted_with_noise(plan, plain.rows(others), theta)))
     return judged
 
 

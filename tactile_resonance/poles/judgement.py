@@ -27,8 +27,8 @@ from tactile_resonance.poles.tables import FitPlan
 
 Plan = TypeVar("Plan", bound=FitPlan)
 
-# Squares of this number cancel in the variance of a residue: beyond, rounding leaves nothing of it, and none
-# of its modes could be told from noise.
+# Squares of this number cancel in the variance of a residue. Beyond it rounding leaves nothing of that
+# variance, and a mode cannot be distinguished from noise.
 LARGEST_CONDITION_NUMBER = 6.7e7
 # Of the variance of a delay by what is not known of other coefficients: beyond it, its deviation means little.
 MOST_INFLATION = 100.0

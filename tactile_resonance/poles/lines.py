@@ -443,14 +443,12 @@ class LinesPlan(FitPlan):
         """Covariance (batch, n, n) of a solution where the variance (batch, F) is not that of `data`."""
         finite, by_one = np.isfinite(data.variance_y), self.structure.delay or self.weights is not None
         alone = by_one | ~(solution.condition < NORMAL_EQUATIONS_LIMIT)
-        covariance = np.full_like(solution.marginal[:, 0], np.nan)
+        inverse = solution.marginal[:, 0]
+        covariance = np.full_like(inverse, np.nan)
         if not alone.all():
             more = data.weighted(variance_y=np.where(finite, data.variance_y**2 / noise, np.inf))
-            own, normal = (
-                likelihood.moments(self.problem.tables, weighted, solution.theta)[2][:, 0, 1]
-                for weighted in (data, more)
-            )
-            covariance = 0.5 * likelihood.sandwich(likelihood.half_inverse(own), normal)
+            normal = likelihood.moments(self.problem.tables, more, solution.theta)[2][:, 0, 1]
+            covariance[~alone] = (0.5 * inverse @ normal @ inverse)[~alone]
         for k in np.flatnonzero(alone):
             row, used = data.rows(slice(k, k + 1)), finite[k]
             at = Linearised.of(self.problem, row, solution.theta[k, 0], self._delay_phase)
@@ -458,8 +456,8 @@ class LinesPlan(FitPlan):
             column = np.linalg.norm(jacobian, axis=0)
             if np.isfinite(column).all() and (column > 0).all():
                 ratio = np.repeat(noise[k, used] / data.variance_y[k, used], 2)
-                inverse = np.linalg.pinv(jacobian / column) / column[:, None]
-                covariance[k] = 0.5 * (inverse * ratio) @ inverse.T
+                of_lines = np.linalg.pinv(jacobian / column) / column[:, None]
+                covariance[k] = 0.5 * (of_lines * ratio) @ of_lines.T
         return covariance
 
     def _fit_dense(self, data: BinData) -> tuple[LinesPlan, Solution]:

@@ -44,7 +44,7 @@ def test_how_long_messages_kept_the_node_is_told_once_for_each_report(monkeypatc
 def test_a_node_that_is_not_active_is_not_well_however_old_its_error(
     monkeypatch, state, with_error, after
 ):
-    """A node that cannot be configured is asked again after up to 16 s, and its error is told for 10."""
+    """A node that cannot be configured is retried after up to 16 s; its error is reported for 10 s."""
     told = []
     with initialised(domain_id=free_domain_id(os.environ)):
         node = rclpy.create_node("health")
