@@ -62,7 +62,7 @@ class Kill:
 
 def without_robot(parameters: dict[str, dict[str, object]]) -> None:
     """Make parameters of `node_parameters` those of ideal contact: the tip is where the scan says."""
-    parameters["fake_hardware_node"]["robot_host"] = "''"
+    parameters["fake_hardware_node"]["robot_host"] = ""
     del parameters["scan_node"]["table_in_base"]  # places are in the frame of the scene
     parameters["scan_node"]["contact"] = "none"
 
@@ -110,7 +110,7 @@ class KilledScan:
         self.scene = scene
         self.nodes = (*STREAM, *(["contact_node"] if robot_host else []), *OTHERS)
         self.parameters = node_parameters(Job(scene, folder, robot_host or HOST), False, folder)
-        self.parameters[MANAGER] = {"nodes": f"[{','.join(self.nodes)}]"}
+        self.parameters[MANAGER] = {"nodes": list(self.nodes)}
         if not robot_host:
             without_robot(self.parameters)
         self._known: dict[str, Finished] = {}

@@ -182,7 +182,7 @@ def on_two_machines(
     parameters = node_parameters(job, False, folder)
     # to count what was published
     parameters["excitation_node"] = {**parameters["excitation_node"], "keep_all_records": True}
-    parameters["manager_node"] = {"nodes": f"[{','.join([*near[:2], *FAR_NODES, *near[2:]])}]"}
+    parameters["manager_node"] = {"nodes": [*near[:2], *FAR_NODES, *near[2:]]}
     if not robot_host:
         without_robot(parameters)
     given = {

@@ -60,8 +60,7 @@ class NodeProcesses:
         nice = ["nice", "-n", str(niceness)] if niceness else []
         command = [*nice, *self._prefix, sys.executable, "-m", module, "--ros-args"]
         for name, value in (parameters or {}).items():
-            text = value if isinstance(value, str) and value else json.dumps(value, default=str)
-            command += ["-p", f"{name}:={text}"]  # what is no text as YAML
+            command += ["-p", f"{name}:={json.dumps(value, default=str)}"]  # JSON is YAML
         self._log_folder.mkdir(parents=True, exist_ok=True)
         with (self._log_folder / f"{node}.log").open("wb") as log:
             self._processes[node] = start_child(command, stdout=log)
@@ -74,7 +73,7 @@ class NodeProcesses:
     ) -> None:
         """Start nodes and the manager that configures and activates them in this order."""
         given = dict(parameters or {})
-        given["manager_node"] = {"nodes": f"[{','.join(nodes)}]"}
+        given["manager_node"] = {"nodes": list(nodes)}
         for node in (*nodes, "manager_node"):
             self.start(node, given.get(node), (niceness or {}).get(node, 0))
 

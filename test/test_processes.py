@@ -11,6 +11,7 @@ import threading
 import time
 
 import pytest
+import yaml
 
 from tactile_resonance.processes import (
     NodeProcesses,
@@ -49,19 +50,37 @@ def test_a_domain_that_is_given_is_taken():
         free_domain_id({"ROS_DOMAIN_ID": "233"})
 
 
+def told_of_ended(nodes, count):
+    """What is told of nodes once so many have ended."""
+    told = ""
+    while told.count("ended with") < count:
+        time.sleep(0.01)
+        try:
+            nodes.check()
+        except RuntimeError as error:
+            told = str(error)
+    return told
+
+
 def test_every_node_that_has_ended_is_named_with_its_last_line(tmp_path):
     with NodeProcesses(tmp_path, ("sh", "-c", "echo begun; echo cause; kill -9 $$")) as nodes:
         for node in ("poles_node", "frf_node"):
             nodes.start(node)
-        told = ""
-        while told.count(";") < 1:  # until both have ended
-            time.sleep(0.01)
-            try:
-                nodes.check()
-            except RuntimeError as error:
-                told = str(error)
+        told = told_of_ended(nodes, 2)
     ended = "ended with exit status -9: cause"
     assert told == f"frf_node {ended}; poles_node {ended}"
+
+
+def test_parameters_reach_a_node_as_they_are(tmp_path):
+    texts = ("", "a: b", "on", "null", "1e3", "[x]", "# no comment", "it's \"so\"", "ü", "/tmp/a b")
+    given = {f"text{k}": text for k, text in enumerate(texts)}
+    given |= {"flag": True, "rate_hz": 2.5, "count": 3, "names": ["1", "on"]}
+    with NodeProcesses(tmp_path, ("printf", "%s\\n")) as nodes:
+        nodes.start("poles_node", {**given, "folder": tmp_path})
+        told_of_ended(nodes, 1)
+    words = (tmp_path / "poles_node.log").read_text().split("--ros-args\n")[1].split("\n")
+    read = dict(word.split(":=", 1) for word in words if ":=" in word)
+    assert {name: yaml.safe_load(text) for name, text in read.items()} == {**given, "folder": str(tmp_path)}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the slack of timers is known on Linux")

@@ -8,6 +8,7 @@ import os
 import socket
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,7 +19,7 @@ from tactile_resonance import msg
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.fields import require
 from tactile_resonance.nodes.frames import BROADCAST_TF, broadcast_fixed, look_up
-from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode
+from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread
 from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
 from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_actions import (
@@ -152,14 +153,16 @@ class ScanNode(ManagedNode):
         """Frames as they stand now, for a goal that is in order."""
         goal, frames = self._files.checked(scan_goal(message)), self._frames
         if goal.resume:
-            resumed_run(goal)
+            await in_thread(self, partial(resumed_run, goal), "check")
             return frames
         stamp = message.poses.header.stamp
         good = stamp.sec >= 0 and stamp.nanosec < 1_000_000_000
         require(good, "poses.header.stamp", (stamp.sec, stamp.nanosec), "a time, or 0")
         poses, missing = await look_up(self, frames.base, named_frames(goal, frames), stamp)
         frames = replace(frames, others=poses, no_others=missing)
-        new_run(goal, frames, self._files, forces=self._hands.free_air)
+        forces = self._hands.free_air
+        work = partial(new_run, goal, frames, self._files, forces=forces)
+        await in_thread(self, work, "check")  # 10 000 poses take seconds
         return frames
 
     async def _check_calibration(self, message: CalibrateTable.Goal) -> CalibrationRequest:

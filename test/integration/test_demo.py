@@ -74,7 +74,7 @@ def interrupt(demo, number, domain):
     """End a demo by a signal; what it wrote to stderr."""
     demo.send_signal(number)
     _, errors = demo.communicate(timeout=HANGS_S)
-    assert demo.returncode == 130
+    assert demo.returncode == 130, errors
     assert "Traceback" not in errors
     assert processes_of(domain) == []
     return errors
@@ -83,7 +83,7 @@ def interrupt(demo, number, domain):
 def test_an_interrupted_scan_says_how_to_go_on_and_its_folder_is_taken(domain, tmp_path):
     demo, run = start(tmp_path, domain), tmp_path / "run"
     deadline = time.monotonic() + HANGS_S
-    while not (run / "scene.yaml").exists() and time.monotonic() < deadline:
+    while not (run / "run.json").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     errors = interrupt(demo, signal.SIGINT, domain)
     command = os.environ.get("TACTILE_RESONANCE_COMMAND", "tactile_resonance")

@@ -42,8 +42,8 @@ blocks: {least: 3, most: 3}
 PLACES = [[0.0, 0.0, 0.0], [0.004, 0.002, 0.0]]
 
 
-def text(frame):
-    return f"[{','.join(str(value) for value in (*frame[0], *frame[1].as_rotvec()))}]"
+def listed(frame):
+    return [float(value) for value in (*frame[0], *frame[1].as_rotvec())]
 
 
 def broadcast(node, **frames):
@@ -64,13 +64,13 @@ def broadcast(node, **frames):
 @pytest.fixture
 def nodes(domain, tmp_path):
     (tmp_path / "dish.yaml").write_text(SCENE)
-    bench = {"scene": tmp_path / "dish.yaml", "serve_contact": True, "table_in_base": text(PHANTOM)}
+    bench = {"scene": tmp_path / "dish.yaml", "serve_contact": True, "table_in_base": listed(PHANTOM)}
     parameters = {
         "fake_hardware_node": bench,
         "excitation_node": {"record_folder": tmp_path / "records"},
-        "scan_node": {"table_in_base": text(TABLE), "run_folder": tmp_path / "runs"},
+        "scan_node": {"table_in_base": listed(TABLE), "run_folder": tmp_path / "runs"},
     }
-    parameters["scan_node"]["goal_folders"] = json.dumps([str(tmp_path)])
+    parameters["scan_node"]["goal_folders"] = [str(tmp_path)]
     for name in ("fake_hardware_node", "excitation_node", "scan_node"):
         parameters[name]["time_server"] = TIME
     with NodeProcesses(tmp_path / "log") as started:

@@ -95,11 +95,11 @@ def scanned(module_domain, tmp_path_factory):
     scene, run = folder / "scene.yaml", folder / "run"
     scene.write_text(SCENE)
     time_server = {"time_server": TIME}
-    ideal = {"serve_contact": True, "table_in_base": str([0.0] * 6)}
+    ideal = {"serve_contact": True, "table_in_base": [0.0] * 6}
     parameters = {
         "fake_hardware_node": {"scene": scene, **ideal, **time_server},
         "excitation_node": {"record_folder": folder / "records", **time_server},
-        "scan_node": {"goal_folders": f"[{folder}]", **time_server},
+        "scan_node": {"goal_folders": [str(folder)], **time_server},
     }
     with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up((*NODES, "scan_node"), parameters)

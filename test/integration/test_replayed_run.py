@@ -117,7 +117,7 @@ def recorded(module_domain, tmp_path_factory):
     parameters = {
         "fake_hardware_node": {"scene": scene, "time_server": TIME},
         "excitation_node": {"record_folder": folder / "records", "time_server": TIME},
-        "scan_node": {"contact": "none", "goal_folders": f"[{folder}]", "time_server": TIME},
+        "scan_node": {"contact": "none", "goal_folders": [str(folder)], "time_server": TIME},
     }
     with NodeProcesses(folder / "log") as nodes, Client(nodes.check) as client:
         nodes.bring_up(("fake_hardware_node", "excitation_node", *READERS, "scan_node"), parameters)

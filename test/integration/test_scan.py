@@ -48,12 +48,12 @@ HOST, TIME = own_host(9), own_time(9)
 def test_a_scan_is_killed_and_resumed(domain, tmp_path):
     scene, run_path = tmp_path / "three.yaml", tmp_path / "run"
     scene.write_text(SCENE)
-    table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
+    table = list(TABLE_IN_BASE)
     parameters = {
         "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": table},
         "excitation_node": {"record_folder": tmp_path / "records"},
         "contact_node": {"robot_host": HOST, "force_host": HOST},
-        "scan_node": {"table_in_base": table, "goal_folders": f"[{tmp_path}]"},
+        "scan_node": {"table_in_base": table, "goal_folders": [str(tmp_path)]},
     }
     for node in parameters.values():
         node["time_server"] = TIME

@@ -74,7 +74,7 @@ def used(module_domain, tmp_path_factory):
     folder = tmp_path_factory.mktemp("security")
     scene, run, used = folder / "scene.yaml", folder / "run", defaultdict(set)
     scene.write_text(SCENE)
-    table = {"table_in_base": f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"}
+    table = {"table_in_base": list(TABLE_IN_BASE)}
     bench = {"scene": scene, **table}
     goal = {"scan_goal": {"scene": scene, "run_directory": run}}
     host = {"robot_host": HOST}
@@ -82,11 +82,11 @@ def used(module_domain, tmp_path_factory):
         "fake_hardware_node": {**bench, **host},
         "excitation_node": {"record_folder": folder / "records"},
         "contact_node": {**host, "force_host": HOST, "touch_from_poles": True},
-        "scan_node": {**table, "goal_folders": f"[{folder}]"},
+        "scan_node": {**table, "goal_folders": [str(folder)]},
     }
     for node in with_robot.values():
         node["time_server"] = TIME
-    with_robot["manager_node"] = {"nodes": f"[{','.join(NODES[:-1])}]"}
+    with_robot["manager_node"] = {"nodes": list(NODES[:-1])}
 
     def scanned():
         return (run / "run.json").exists() and len(read_run(run).results) == 1

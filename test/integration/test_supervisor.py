@@ -96,11 +96,11 @@ def stack(module_domain, tmp_path_factory):
     """Nodes that run, and who supervises them."""
     folder = tmp_path_factory.mktemp("supervised")
     (folder / "two.yaml").write_text(SCENE)
-    table = f"[{','.join(str(value) for value in TABLE_IN_BASE)}]"
+    table = list(TABLE_IN_BASE)
     parameters = {
         "fake_hardware_node": {"scene": folder / "two.yaml", "serve_contact": True},
         "excitation_node": {"record_folder": folder / "records"},
-        "scan_node": {"table_in_base": table, "goal_folders": f"[{folder}]"},
+        "scan_node": {"table_in_base": table, "goal_folders": [str(folder)]},
     }
     for given in parameters.values():
         given["time_server"] = TIME

@@ -35,7 +35,7 @@ HOST, ROBOT_HOST = own_host(96), own_host(97)
 
 
 def listed(pose):
-    return f"[{','.join(repr(float(value)) for value in pose)}]"
+    return [float(value) for value in pose]
 
 
 def correction(outcome):
@@ -57,7 +57,7 @@ class Bench:
         parameters["scan_node"]["run_folder"] = folder / "runs"
         if ideal:
             parameters["fake_hardware_node"].update(
-                serve_contact=True, robot_host="''", time_server=own_time(96)
+                serve_contact=True, robot_host="", time_server=own_time(96)
             )
             parameters["scan_node"]["time_server"] = own_time(96)
         self.parameters = parameters

@@ -88,7 +88,7 @@ def parameters_of(tmp_path, scene, true):
         "fake_hardware_node": {"scene": scene, "robot_host": HOST, "table_in_base": listed(true)},
         "excitation_node": {"record_folder": tmp_path / "records"},
         "contact_node": {"robot_host": HOST, "force_host": HOST},
-        "scan_node": {"table_in_base": listed(TABLE_IN_BASE), "goal_folders": f"[{tmp_path}]"},
+        "scan_node": {"table_in_base": listed(TABLE_IN_BASE), "goal_folders": [str(tmp_path)]},
     }
     for node in parameters.values():
         node["time_server"] = TIME
@@ -96,7 +96,7 @@ def parameters_of(tmp_path, scene, true):
 
 
 def listed(pose):
-    return f"[{','.join(repr(float(value)) for value in pose)}]"
+    return [float(value) for value in pose]
 
 
 @pytest.mark.slow
