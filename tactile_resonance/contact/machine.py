@@ -334,7 +334,7 @@ class ContactController:
         waited = now_ns - self._state_ns > LINGER_NS
         if isinstance(fault, ArmError) or self._envelope.judge_arm(now_ns, arm) is not None:
             self._stays = True
-        elif fault is None and (wished or (waited and not self._stays)):
+        elif wished or (waited and not self._stays):
             self._free.rest_m, self._rising = self._usual_m, True
             self._enter(State.RETRACT, now_ns)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.goal import Aim, ContactGoal, State
-from tactile_resonance.contact.interfaces import ArmFault, Mount
+from tactile_resonance.contact.interfaces import ArmFault, ForceFault, Mount
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
@@ -152,9 +152,12 @@ def test_tip_that_waits_low_rises_after_a_second_and_takes_a_goal_meanwhile():
     assert rig.controller.result.cause is Cause.CANCELLED
 
 
-def test_tip_that_waits_low_rises_at_once_where_it_is_asked_to():
+@pytest.mark.parametrize("fault", [None, ForceFault.SILENT])
+def test_tip_that_waits_low_rises_at_once_where_it_is_asked_to(fault):
     rig = made()
     states(rig, goal(rig, 0.0, LOW_M))
+    rig.bench.cell.error = fault
+    rig.run(0.1)
     rig.controller.retract()
     assert not rig.controller.settled
     rig.run(0.6)
