@@ -241,7 +241,7 @@ class Envelope:
         if place.depth_m is not None and place.depth_m > limits.depth_m:
             text = f"{1e3 * place.depth_m:.2f} mm past the first touch, limit {1e3 * limits.depth_m:g} mm"
             return Breach(Cause.DEPTH, text)
-        if place.height_m < limits.near_m:
+        if place.depth_m is not None or place.height_m < limits.near_m:
             inwards = -dot(place.normal, arm.velocity[:3])
             if inwards > SPEED_MARGIN * limits.near_speed_m_s:
                 text = f"{1e3 * inwards:.1f} mm/s towards the surface near it"

@@ -163,6 +163,9 @@ def test_upright_arm_passes(rotation):
         ([0, 0, 0], (0.05, None, 0.5, 0.9e-4), Cause.HOUSING),
         ([0, 0, 0], (0.05, None, 0.5, 1.1e-4), None),
         ([0, 0, 0.05], (0.001, 1e-3, 0.0), None),
+        # a surface that is found higher than what counts as near
+        ([0, 0, -0.008], (0.008, 1e-4, 0.0), Cause.SPEED),
+        ([0, 0, 0], (0.008, 1e-4, 0.06), Cause.MISALIGNED),
     ],
 )
 def test_motion_near_the_surface_is_judged(velocity, place, cause):
