@@ -101,7 +101,7 @@ class ContactResult:
     total_s : float
         From the start until it was reached, or failed [s].
     peak_force_n : float
-        Largest single measured force along the normal [N]; 0 before the tare.
+        Largest single measured force along the normal so far [N]; 0 before the tare.
     retracted : bool
         Whether the tip is back at the standoff.
     zero_change_n : float or None
@@ -152,10 +152,12 @@ class Outcome:
 
     def result(self, holding: bool) -> ContactResult | None:
         """Once it was reached or failed; the force is the mean so far while it is held."""
-        result, mean = self._result, self._observer.mean_force()
-        if result is not None and holding and mean is not None:
-            return replace(result, force_n=mean[0], force_std_n=mean[1])
-        return result
+        if self._result is None:
+            return None
+        # after a contact is given up the force still rises until the tip has turned round
+        result = replace(self._result, peak_force_n=self._observer.watch.peak_n)
+        mean = self._observer.mean_force() if holding else None
+        return result if mean is None else replace(result, force_n=mean[0], force_std_n=mean[1])
 
     def reached(
         self, now_ns: int, touched_ns: int, estimate: ContactEstimate, told_m: float | None
@@ -197,12 +199,8 @@ class Outcome:
             breach.cause is Cause.HELD and result.cause is not Cause.HELD
         ):
             before = "" if result.cause is Cause.NONE else f"; before: {result.message}"
-            self._result = replace(
-                result,
-                cause=breach.cause,
-                message=breach.message + before,
-                peak_force_n=self._observer.watch.peak_n,
-            )
+            message = breach.message + before
+            self._result = replace(result, cause=breach.cause, message=message)
 
     def drawn_back(self, zero_n: float | None) -> None:
         """Note that the tip is back at the standoff, and what the force source shows there.
