@@ -23,8 +23,8 @@ from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import Vector, added, difference, dot, scaled, vector
 
-STILL_M_S, STILL_NS = 5e-4, 50_000_000
-"""Below this speed for so long the arm is at rest [m/s], [ns]."""
+STILL_M_S, STILL_RAD_S, STILL_NS = 5e-4, 1e-2, 50_000_000
+"""Below these speeds for so long the arm is at rest [m/s], [rad/s], [ns]."""
 
 BESIDE_M = 0.05
 """So far beside the way of a goal the tip may be [m]."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tactile_resonance.clock import Clock, Demand
-from tactile_resonance.contact.free_motion import STILL_M_S
+from tactile_resonance.contact.free_motion import STILL_M_S, STILL_RAD_S
 from tactile_resonance.contact.geometry import TipPath
 from tactile_resonance.contact.goal import TOUCHING, Command, ContactGoal, State
 from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, Cell, ForceError, Mount
@@ -225,8 +225,10 @@ class ContactLoop:
 
 
 def _rests(arm: ArmSample | None) -> bool:
-    """Whether an arm is seen to stand still; False where a speed is not finite."""
-    return arm is not None and math.hypot(*arm.velocity[:3]) < STILL_M_S
+    """Whether an arm is seen to stand still, and not to turn; False where a speed is not finite."""
+    if arm is None or not math.hypot(*arm.velocity[:3]) < STILL_M_S:
+        return False
+    return math.hypot(*arm.velocity[3:]) < STILL_RAD_S
 
 
 RECORDED = (State.APPROACH, *TOUCHING, State.RETRACT)

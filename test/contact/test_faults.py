@@ -261,6 +261,18 @@ def test_largest_force_is_that_after_the_contact_was_given_up(seed):
     assert abs(made.controller.result.peak_force_n - max(made.force_n)) < 5 * noise_n
 
 
+def test_arm_that_turns_on_the_spot_is_not_taken_to_stand():
+    made = contact()
+    arm = made.bench.arm
+    arm.speed([0, 0, 0, 0, 0, 0.3], 2.0)
+    made.bench.clock.wait_until(300_000_000)
+    stop, stops = arm.stop, []
+    arm.stop = lambda a: stop(a) if len(stops) > 3 else stops.append(a)  # the first ones are lost
+    assert made.loop.bring_to_rest() == ""
+    assert len(stops) > 3
+    assert max(map(abs, arm.state().velocity)) < 1e-2
+
+
 @pytest.mark.parametrize(
     "fault", [ArmFault.REGISTERS_IN_USE, ArmFault.NOT_REMOTE, ArmFault.PROGRAM_NOT_STARTED]
 )
