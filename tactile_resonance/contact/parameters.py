@@ -207,7 +207,7 @@ STRICTER_BELOW = frozenset(
         *("depth_m", "near_speed_m_s", "contact_speed_m_s", "lateral_speed_m_s", "free_speed_m_s"),
         *("angular_speed_rad_s", "tilt_rad", "misalignment_rad", "force_age_s", "arm_age_s"),
         *("stuck_samples", "search_m", "early_m", "unknown_speed_m_s", "known_radius_m"),
-        *("tare_std_n", "tare_drift_n_per_s", "tare_offset_n"),
+        *("tare_std_n", "tare_drift_n_per_s", "tare_offset_n", "cell_noise_n", "carried_kg"),
     }
 )
 STRICTER_ABOVE = frozenset({"near_m", "clearance_m"})

@@ -35,6 +35,7 @@ LAXER_ABOVE = [
     *("angular_speed_rad_s", "tilt_rad", "misalignment_rad", "force_age_s", "arm_age_s"),
     *("stuck_samples", "contact.search_m", "contact.early_m"),
     *("contact.tare_std_n", "contact.tare_drift_n_per_s", "contact.tare_offset_n"),
+    "contact.cell_noise_n",
 ]
 
 
@@ -81,6 +82,11 @@ def test_a_limit_that_protects_the_tissue_is_made_stricter_and_never_laxer(launc
     assert ask(node, **{name: below}) == ""
     assert node.get_parameter(full(name)).value == below
     assert ask(node, **{name: limit}) == ""  # back to what the launch set
+
+
+def test_a_cell_that_carries_nothing_at_the_launch_carries_nothing_later(launch):
+    name = "contact.carried_kg"
+    assert ask(launch(), **{name: 0.1}).startswith(f"{name}: got 0.1; accepted is at most 0.0")
 
 
 @pytest.mark.parametrize("name", ["near_m", "clearance_m"])
