@@ -247,7 +247,6 @@ class FakeHardwareNode(ManagedNode):
         self.serve(Play, "bench/play", self._on_play)
         self.serve_trigger("bench/stop", self._silence)
         self.serve(Truth, "bench/get_truth", self._on_truth)
-        self._said_lines = 0
 
     def details(self) -> dict[str, str]:
         """How often the simulated robot stood still, as of the last measurement."""
@@ -293,10 +292,6 @@ class FakeHardwareNode(ManagedNode):
         except (ValueError, ClockLostError) as error:
             response.message = str(error)
             return response
-        effort = run.effort(excitation)
-        if effort.lines != self._said_lines:
-            self._said_lines = effort.lines
-            self.get_logger().info(str(effort))
         response.accepted, response.start = True, time_message(start_ns)
         self._played = asked, response
         return response

@@ -26,12 +26,7 @@ from tactile_resonance.simulation.sensor.bimorph import (
     parts_of,
 )
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
-from tactile_resonance.simulation.sensor.response import (
-    Lines,
-    PoleResidueModel,
-    ResponseStream,
-    steady_state,
-)
+from tactile_resonance.simulation.sensor.response import Lines, PoleResidueModel, ResponseStream
 from tactile_resonance.simulation.tissue.hertz import (
     HertzParameters,
     Tissue,
@@ -102,38 +97,6 @@ def convert(volts: FloatArray, scale_v: float, bits: int) -> Channel:
     return Channel(counts, scale_v, saturated=saturated)
 
 
-@dataclass(frozen=True)
-class Effort:
-    """What is simulated for an excitation from rest, and what is left out because no record would show it.
-
-    Attributes
-    ----------
-    lines, possible_lines : int
-        Lines of the steady state that are computed, and that a period has room for.
-    decays, poles : int
-        Poles whose free decay is computed, and all.
-    settled_s : float
-        Time after which no free decay is computed any more [s].
-    omitted_v : float
-        Bound on what is left out, at any instant [V].
-    """
-
-    lines: int
-    possible_lines: int
-    decays: int
-    poles: int
-    settled_s: float
-    omitted_v: float
-
-    def __str__(self) -> str:
-        """One line for a log."""
-        return (
-            f"simulates {self.lines} of {self.possible_lines} lines and the free decay of "
-            f"{self.decays} of {self.poles} poles, up to {self.settled_s:.2g} s; leaves out at "
-            f"most {self.omitted_v:.1g} V"
-        )
-
-
 class BenchRun:
     """One stay of the tip at one point: excitations are played one after another, from rest.
 
@@ -189,24 +152,6 @@ class BenchRun:
         approximation of the nonlinear sensor differs.
         """
         return self.coupled if self._coupled_at is None else self._coupled_at(time_s)
-
-    def effort(self, excitation: Excitation | Lines) -> Effort:
-        """Return what an excitation from rest takes; computed without playing it."""
-        lines, model = Lines.of(excitation), self.coupled.modal
-        size = model.weights * np.abs(steady_state(model, lines))  # (K,)
-        # below the converter's floor, or lost in the rounding of the sum
-        floor = 0.0 if self.effects.nonlinearity else self.negligible_v
-        floor = max(floor, np.finfo(float).eps / 100 * float(size.max(initial=0.0)))
-        keep = size > floor
-        lasting = np.log(size[keep] / floor) / -model.poles_rad_s.real[keep]
-        return Effort(
-            lines=lines.harmonics.size,
-            possible_lines=(lines.samples_per_period - 1) // 2,
-            decays=int(keep.sum()),
-            poles=size.size,
-            settled_s=float(lasting.max(initial=0.0)),
-            omitted_v=float(np.minimum(size, floor).sum()),
-        )
 
     def block(self, excitation: Excitation | Lines, periods: int = 1) -> Record:
         """Return the next periods of an excitation as one block; its origin's time counts from the start."""
