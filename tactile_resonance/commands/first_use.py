@@ -16,7 +16,7 @@ STEPPED = tuple(
     f"tactile_resonance.{name}"
     for name in (
         *("contact.contact_filter", "simulation.cell.transducer"),
-        *("simulation.noise", "simulation.tissue.indenter"),
+        *("simulation.noise", "simulation.sensor.nonlinear", "simulation.tissue.indenter"),
         *(f"simulation.ur5e.{name}" for name in ("forces", "kinematics", "poses")),
     )
 )

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 from rosgraph_msgs.msg import Clock
@@ -225,6 +226,8 @@ class FakeHardwareNode(ManagedNode):
         scene, self._frame_id = values(self, "scene", "frame_id")
         scene_path = file_of(scene)
         self._bench = SimulatedBench.from_configuration()
+        if values(self, "nonlinearity")[0]:  # now: numba takes a while to load
+            import_module("tactile_resonance.simulation.sensor.nonlinear")
         read = read_scene(read_tissues(), scene_path)
         host, table, seed = values(self, "robot_host", "table_in_base", "seed")
         server, plant = self.time_server, None

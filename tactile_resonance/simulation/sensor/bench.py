@@ -11,6 +11,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +26,6 @@ from tactile_resonance.simulation.sensor.bimorph import (
     couple,
     parts_of,
 )
-from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
 from tactile_resonance.simulation.sensor.response import Lines, PoleResidueModel, ResponseStream
 from tactile_resonance.simulation.tissue.hertz import (
     HertzParameters,
@@ -34,6 +34,9 @@ from tactile_resonance.simulation.tissue.hertz import (
     hertz_contact,
 )
 from tactile_resonance.simulation.tissue.library import read_tissues
+
+if TYPE_CHECKING:
+    from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
 
 NEGLIGIBLE_COUNTS = 1e-3  # of the converter
 _SENSOR, _ACTUATOR, _HUM = range(3)  # independent random streams of a run
@@ -130,6 +133,9 @@ class BenchRun:
                 self._coupled_at, delay_s=late_s, negligible_v=negligible_v
             )
         elif effects.nonlinearity:
+            # only here: it loads numba
+            from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
+
             self._sensor = NonlinearStream(modal, sensor.nonlinear, delay_s=late_s)
         else:
             self._sensor = ResponseStream(modal, delay_s=late_s, negligible_v=negligible_v)

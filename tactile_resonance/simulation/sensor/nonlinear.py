@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sensor with a static nonlinearity in its drive, in steady state and from rest.
+"""The sensor with a static nonlinearity in its drive, from rest.
 
 The strain dynamics S (the linear sensor without its feedthrough) are driven by
 ``u + a2 u^2 + a3 u^3 + g2 s^2 + g3 s^3``, s the strain voltage; ``Us = s + gamma u``.
-What depends on u alone is periodic and treated exactly, as further lines. What depends on s is
-found by fixed-point (Picard) iteration, over the period in steady state, and window by window when
-the record starts from rest.
+What depends on u alone is periodic and treated exactly, as further lines. What depends on s, e, is between
+samples the cubic through the sample after and the three before, for which every pole is integrated exactly
+(exponential Adams-Moulton method of fourth order): ``z_n = E z_{n-1} + r sum_{q=0}^{3} w_q e_{n-q}``,
+``E = exp(p h)``. It is as stable as the model whatever the interval h.
+
+Each sample takes the one before, so that is compiled. numba looks at the date of this file alone: whatever is
+compiled for it is in here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import scipy.fft
+from numba import complex128, float64, njit
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.fields import require
@@ -26,102 +30,30 @@ from tactile_resonance.simulation.sensor.response import (
     sample_period,
 )
 
-
-class WindowKernel:
-    """Zero-start response of a model to a sampled input over one window, and its bookkeeping.
-
-    Between samples the input is the cubic through the sample after and the three before, for
-    which every pole is integrated exactly (exponential Adams-Moulton method of fourth order):
-    ``z_n = E z_{n-1} + r sum_{q=0}^{3} w_q e_{n-q}``, ``E = exp(p h)``. It is causal, and as stable
-    as the model whatever the interval.
-
-    Parameters
-    ----------
-    model : PoleResidueModel
-        Strictly proper.
-    size : int
-        Samples in the window.
-    interval_s : float
-        h [s].
-    """
-
-    PAST = 3  # input samples before the window that still count, latest first
-
-    def __init__(self, model: PoleResidueModel, size: int, interval_s: float) -> None:
-        poles, residues, weights = model.poles_rad_s, model.residues_rad_s, model.weights
-        lags = self.PAST + 1
-        step = residues[:, None] * _adams_weights(poles, interval_s)  # (K, lags)
-        powers = np.exp(np.outer(poles, np.arange(size + 1)) * interval_s)  # (K, size + 1)
-        # effect of one input sample on all states at the samples after it: the sample p before
-        # the window start reaches them from lag q = p on, that at the start from lag 0
-        effect = np.zeros((lags, poles.size, size), dtype=complex)  # (p, K, size)
-        for p in range(lags):
-            for q in range(p, min(lags, p + size)):
-                effect[p, :, q - p :] += step[:, q, None] * powers[:, : size - (q - p)]
-        output = (weights[:, None] * effect).real.sum(axis=1)  # (p, size)
-        self._size = size
-        self._length = scipy.fft.next_fast_len(2 * size, real=True)
-        self._spectrum = scipy.fft.rfft(output[0], self._length)
-        self._past_output = output[1:]  # (PAST, size)
-        free = weights[:, None] * powers[:, 1:]  # (K, size)
-        self._free_output = np.vstack([free.real, -free.imag])  # (2 K, size)
-        self._end_power = powers[:, size]
-        self._end_past = effect[1:, :, -1]  # (PAST, K)
-        self._end_window = effect[0][:, ::-1]  # (K, size): input sample m counts effect[size-1-m]
-
-    def history(self, state: ComplexArray, past: FloatArray) -> FloatArray:
-        """Return the output over the window due to what was before it, shape (size,).
-
-        Parameters
-        ----------
-        state : (K,) array
-            Modal state at the sample before the window.
-        past : (PAST,) array
-            Input samples before the window, latest first.
-        """
-        free = np.concatenate([state.real, state.imag]) @ self._free_output
-        return np.asarray(free + past @ self._past_output)
-
-    def convolve(self, signal: FloatArray) -> FloatArray:
-        """Return the output over the window due to the input (size,) within it."""
-        spectrum = self._spectrum * scipy.fft.rfft(signal, self._length)
-        return np.asarray(scipy.fft.irfft(spectrum, self._length)[: self._size])
-
-    def advance(
-        self, state: ComplexArray, past: FloatArray, signal: FloatArray
-    ) -> tuple[ComplexArray, FloatArray]:
-        """Return state and past at the end of the window."""
-        end = self._end_power * state + past @ self._end_past + self._end_window @ signal
-        latest_first = np.concatenate([signal[::-1], past])[: self.PAST]
-        return end, latest_first
+# The cube of a signal reaches three times its highest line; with four times the sample rate no
+# product of the drive folds back into the band of the drive.
+OVERSAMPLING = 4
+NODES = np.array([1.0, 0.0, -1.0, -2.0])
+"""Samples of the cubic, in intervals from the one before."""
+MOST_ITERATIONS, TOLERANCE = 50, 1e-15
+"""Of the newest sample, of which its own term is a small part."""
+BEYOND = 1e3
+"""Times the strain of the linear sensor: a response that grows without bounds."""
 
 
 def _adams_weights(poles: ComplexArray, interval_s: float) -> ComplexArray:
-    """Return ``integral_0^h exp(p (h - t)) l_q(t) dt``, shape (K, 4), q = 0 ... 3 samples back.
+    """Return ``integral_0^h exp(p (h - t)) l_q(t) dt``, shape (4, K), q = 0 ... 3 samples back.
 
-    l_q are the Lagrange polynomials on the nodes h, 0, -h, -2 h. By Gauss-Legendre quadrature,
-    where the closed form would cancel for slow poles; for fast ones in as many pieces as needed.
+    l_q are the Lagrange polynomials on `NODES`. By Gauss-Legendre quadrature, where the closed form would
+    cancel for slow poles; for fast ones in as many pieces as needed.
     """
     points, gauss = np.polynomial.legendre.leggauss(16)
     pieces = 1 + int(np.abs(poles * interval_s).max(initial=0.0))
     edges = np.arange(pieces)[:, None]
     x = ((edges + (points + 1) / 2) / pieces).ravel()  # t / h in (0, 1)
     weight = np.tile(gauss / (2 * pieces), pieces) * interval_s
-    nodes = np.array([1.0, 0.0, -1.0, -2.0])
-    lagrange = np.ones((4, x.size))
-    for q in range(4):
-        for other in range(4):
-            if other != q:
-                lagrange[q] *= (x - nodes[other]) / (nodes[q] - nodes[other])
-    kernel = np.exp(np.outer(poles, 1 - x) * interval_s)  # (K, x)
-    return np.asarray((kernel * weight) @ lagrange.T)
-
-
-# The cube of a signal reaches three times its highest line; with four times the sample rate no
-# product of the drive folds back into the band of the drive.
-OVERSAMPLING = 4
-WINDOW = 512  # fine samples per window: short, so that the iteration contracts fast
-TOLERANCE, MOST_ITERATIONS = 1e-13, 100
+    lagrange = np.linalg.solve(np.vander(NODES).T, np.vander(x, NODES.size).T)  # (4, x)
+    return np.asarray((lagrange * weight) @ np.exp(np.outer(1 - x, poles) * interval_s))
 
 
 def effective_drive(
@@ -142,84 +74,36 @@ def effective_drive(
     return Lines(np.arange(highest + 1), phasor, fine.sample_rate_hz, fine.samples_per_period)
 
 
-def solve_strain(
-    known_v: FloatArray,
-    feedback: Callable[[FloatArray], FloatArray],
-    nonlinear: NonlinearParameters,
-    lines: Lines,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the strain ``s = known + feedback(g2 s^2 + g3 s^3)`` and that term [V], by Picard's iteration.
-
-    Raises
-    ------
-    ValueError
-        If it does not converge: its loop gain, about ``3 g3 s^2 |S|`` at resonance, exceeds 1, as for a
-        narrow-band drive of 4 V rms.
-    """
-    g2, g3 = nonlinear.strain_quadratic_per_v, nonlinear.strain_cubic_per_v2
-    strain, scale = known_v, float(np.abs(known_v).max())
-    with np.errstate(over="ignore", invalid="ignore"):
+@njit(
+    (
+        *(float64[::1], complex128[::1], complex128[::1], complex128[:, ::1]),
+        *(float64[::1], float64, float64),
+    ),
+    cache=True,
+)
+def _march(strain, state, decay, step, past, g2, g3):
+    """Make the strain [V] of what it is driven to, in place; moves `state` (K,) and `past` (3,) on."""
+    direct = step[0].real.sum()
+    for n in range(strain.size):
+        known, term, e1, e2, e3 = strain[n], 0.0, past[0], past[1], past[2]
+        for k in range(state.size):
+            state[k] = decay[k] * state[k] + e1 * step[1, k] + e2 * step[2, k] + e3 * step[3, k]
+            known += state[k].real
+        s = known
         for _ in range(MOST_ITERATIONS):
-            term = (g2 + g3 * strain) * strain * strain
-            following = known_v + feedback(term)
-            change = float(np.abs(following - strain).max())
-            strain = following
-            if change <= TOLERANCE * scale:
-                return strain, term
-            if not change < 1e3 * scale:
+            before, term = s, (g2 + g3 * s) * s * s
+            s = known + direct * term
+            if not abs(s - before) > TOLERANCE * abs(s):
                 break
-    rms_v = np.linalg.norm(lines.phasor_v) / np.sqrt(2)
-    count, highest_hz = lines.harmonics.size, lines.frequency_hz[-1]
-    raise ValueError(
-        f"amplitude_v: got {rms_v:.3g} V rms on {count} lines up to {highest_hz:g} Hz; accepted is a drive "
-        "weak enough for the sensor's nonlinearity (its response grows beyond bounds); lower the level or "
-        "spread it over more lines"
-    )
-
-
-def nonlinear_steady_state(
-    model: PoleResidueModel,
-    nonlinear: NonlinearParameters,
-    lines: Lines,
-    *,
-    oversampling: int = OVERSAMPLING,
-) -> FloatArray:
-    """Return one period of the nonlinear sensor's voltage Us [V] in steady state, (samples_per_period,).
-
-    Parameters
-    ----------
-    model : PoleResidueModel
-        The linear sensor, feedthrough as direct term.
-    nonlinear : NonlinearParameters
-    lines : Lines
-        The drive.
-    oversampling : int
-        Products of the strain above half the fine sample rate fold back: 4 or more.
-
-    Raises
-    ------
-    ValueError
-        As `solve_strain`.
-    """
-    drive = effective_drive(lines, nonlinear, oversampling)
-    count = drive.samples_per_period
-    frequency_hz = np.arange(count // 2 + 1) * (drive.sample_rate_hz / count)
-    response = replace(model, direct=0.0).frequency_response(frequency_hz)
-    response[-1] = 0.0  # half the sample rate has no phase
-
-    def feedback(term: FloatArray) -> FloatArray:
-        return np.asarray(scipy.fft.irfft(response * scipy.fft.rfft(term), count))
-
-    linear = sample_period(drive, response[drive.harmonics])
-    strain, _ = solve_strain(linear, feedback, nonlinear, lines)
-    return strain[::oversampling] + model.direct * sample_period(lines)
+        for k in range(state.size):
+            state[k] += term * step[0, k]
+        past[0], past[1], past[2], strain[n] = term, e1, e2, s
 
 
 class NonlinearStream:
     """The nonlinear sensor's response, from rest, to one excitation after another.
 
-    Counterpart of `ResponseStream`, sample for sample the same when all coefficients are 0. The
-    strain term is integrated exactly for its cubic interpolation between fine samples.
+    Counterpart of `ResponseStream`, sample for sample the same when all coefficients are 0.
 
     Parameters
     ----------
@@ -240,18 +124,15 @@ class NonlinearStream:
         delay_s: float = 0.0,
         oversampling: int = OVERSAMPLING,
     ) -> None:
-        self._oversampling = oversampling
-        self._nonlinear = nonlinear
-        self._strain_model = replace(model, direct=0.0)
-        self._driven = ResponseStream(self._strain_model, delay_s=delay_s)
+        self._oversampling, self._nonlinear = oversampling, nonlinear
+        self._model = replace(model, direct=0.0)
+        self._driven = ResponseStream(self._model, delay_s=delay_s)
         nothing = np.zeros(0, dtype=complex)
-        self._through = ResponseStream(
-            PoleResidueModel(nothing, nothing, model.direct), delay_s=delay_s
-        )
+        through = PoleResidueModel(nothing, nothing, model.direct)
+        self._through = ResponseStream(through, delay_s=delay_s)
         self._drive: tuple[Lines, Lines] | None = None  # lines and their effective drive
-        self._state = np.zeros(model.poles_rad_s.size, dtype=complex)  # due to the strain term
-        self._past = np.zeros(WindowKernel.PAST)  # last values of the strain term
-        self._kernels: dict[tuple[int, float], WindowKernel] = {}
+        # due to the strain term, each pole as often as it counts; last values of that term
+        self._state, self._past = np.zeros(model.poles_rad_s.size, dtype=complex), np.zeros(3)
 
     def play(self, lines: Lines) -> FloatArray:
         """Return the response to the next period of an excitation, as `ResponseStream.play`.
@@ -259,25 +140,26 @@ class NonlinearStream:
         Raises
         ------
         ValueError
-            If the response grows beyond bounds.
+            If it grows beyond bounds: the loop gain, about ``3 g3 s^2 |S|`` at resonance, exceeds 1, as for a
+            narrow-band drive of 4 V rms.
         """
-        through = self._through.play(lines)
+        through, model, nonlinear = self._through.play(lines), self._model, self._nonlinear
         if self._drive is None or not lines.same_signal(self._drive[0]):
-            self._drive = (lines, effective_drive(lines, self._nonlinear, self._oversampling))
-        driven = self._driven.play(self._drive[1])
-        strain = np.empty_like(driven)
-        for begin in range(0, driven.size, WINDOW):
-            window = slice(begin, begin + WINDOW)
-            strain[window] = self._solve_window(driven[window], lines)
+            self._drive = (lines, effective_drive(lines, nonlinear, self._oversampling))
+        drive = self._drive[1]
+        strain, interval_s = self._driven.play(drive), 1 / drive.sample_rate_hz
+        most_v = BEYOND * float(np.abs(strain).max())
+        step = model.weights * model.residues_rad_s * _adams_weights(model.poles_rad_s, interval_s)
+        _march(
+            *(strain, self._state, np.exp(model.poles_rad_s * interval_s), step, self._past),
+            *(nonlinear.strain_quadratic_per_v, nonlinear.strain_cubic_per_v2),
+        )
+        if not np.abs(strain).max() <= most_v:
+            rms_v = np.linalg.norm(lines.phasor_v) / np.sqrt(2)
+            count, highest_hz = lines.harmonics.size, lines.frequency_hz[-1]
+            raise ValueError(
+                f"amplitude_v: got {rms_v:.3g} V rms on {count} lines up to {highest_hz:g} Hz; accepted is a "
+                "drive weak enough for the sensor's nonlinearity (its response grows beyond bounds); lower the "
+                "level or spread it over more lines"
+            )
         return strain[:: self._oversampling] + through
-
-    def _solve_window(self, driven: FloatArray, lines: Lines) -> FloatArray:
-        """Add the feedback of the strain term to the driven strain, and move on."""
-        key = driven.size, lines.sample_rate_hz * self._oversampling
-        if key not in self._kernels:
-            self._kernels[key] = WindowKernel(self._strain_model, key[0], 1 / key[1])
-        kernel = self._kernels[key]
-        known = driven + kernel.history(self._state, self._past)
-        strain, term = solve_strain(known, kernel.convolve, self._nonlinear, lines)
-        self._state, self._past = kernel.advance(self._state, self._past, term)
-        return strain
