@@ -18,7 +18,7 @@ from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.simulation.plant.surfaces import RoundSurface, SurfaceMotion
-from tactile_resonance.simulation.plant.tip import Ball, Clinging, OnBone
+from tactile_resonance.simulation.plant.tip import Ball, OnSoft, bone, clinging
 from tactile_resonance.simulation.tissue.indenter import Indenter
 
 HOLD_S, SETTLED_S, SOFT_PA = 4.0, 0.5, 3e3
@@ -94,7 +94,7 @@ class Bone:
 
     def __call__(self, rng: Draw, radius_m: float) -> Callable[[Indenter], Ball]:
         layer_m = rng.uniform(0.0, self.layer_m)
-        return lambda soft: OnBone(soft, layer_m=layer_m, radius_m=radius_m)
+        return lambda soft: OnSoft(soft, bone(layer_m, radius_m))
 
 
 class Film:
@@ -106,7 +106,7 @@ class Film:
         def pull(height_m: float, up_m_s: float) -> float | None:
             return None if height_m > tears_m else damping * max(0.0, up_m_s)
 
-        return lambda soft: Clinging(soft, pull)
+        return lambda soft: OnSoft(soft, clinging(pull))
 
 
 class Hook:
@@ -114,7 +114,8 @@ class Hook:
 
     def __call__(self, rng: Draw, radius_m: float) -> Callable[[Indenter], Ball]:
         stiffness = rng.uniform(5.0, 40.0)
-        return lambda soft: Clinging(soft, lambda height_m, _: stiffness * height_m)
+        hook = clinging(lambda height_m, _: stiffness * height_m)
+        return lambda soft: OnSoft(soft, hook)
 
 
 MOTIONS = {

@@ -17,7 +17,7 @@ from tactile_resonance.contact.pressing import HeldMotion
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
-from tactile_resonance.simulation.plant.tip import Clinging, OnBone, RigidTip, Tip
+from tactile_resonance.simulation.plant.tip import OnSoft, RigidTip, Tip, bone, clinging
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -73,7 +73,7 @@ def test_motion_that_has_not_turned_has_no_rate():
 
 
 def peak_n(layer_m, parameters, seed, beam=None):
-    tip = Tip(RADIUS_M, beam, meets=lambda soft: OnBone(soft, layer_m=layer_m, radius_m=RADIUS_M))
+    tip = Tip(RADIUS_M, beam, meets=lambda soft: OnSoft(soft, bone(layer_m, RADIUS_M)))
     tissue = replace(SOFT, relaxation_modulus_1s_pa=1.5e3)  # 3 kPa at once
     made = contact(tissue, parameters=parameters, tip=tip, seed=seed, height_m=1.5e-3)
     made.loop.start(made.goal)
@@ -105,7 +105,7 @@ def test_where_one_pressed_too_hard_the_next_touch_is_slow_again():
     harder = ContactGoal(made.goal.touch, Aim(0.018))
     assert not is_known(controller, harder)  # as deep as that nobody has been
     made.bench.plant._on = RigidTip(
-        OnBone(made.bench.plant._on.indenter, layer_m=1e-4, radius_m=RADIUS_M)
+        OnSoft(made.bench.plant._on.indenter, bone(1e-4, RADIUS_M))
     )
     made.loop.make(made.goal)
     made.run_until(State.IDLE, 5.0)
@@ -121,8 +121,9 @@ def test_place_is_forgotten_when_pressed_too_hard_whatever_becomes_of_the_tip():
     controller = made.controller
     assert is_known(controller, made.goal)
     # bone below, and a hook that holds the tip when it is drawn back: `held` is the cause in the end
-    bone = OnBone(made.bench.plant._on.indenter, layer_m=1e-4, radius_m=RADIUS_M)
-    made.bench.plant._on = RigidTip(Clinging(bone, lambda height_m, _: 40.0 * height_m))
+    on_bone = OnSoft(made.bench.plant._on.indenter, bone(1e-4, RADIUS_M))
+    hook = clinging(lambda height_m, _: 40.0 * height_m)
+    made.bench.plant._on = RigidTip(OnSoft(on_bone, hook))
     made.loop.make(made.goal)
     made.run_until(State.IDLE, 4.0)
     assert controller.state is State.FAULT

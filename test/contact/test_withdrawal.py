@@ -12,7 +12,7 @@ from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.plant.surfaces import FlatSurface
-from tactile_resonance.simulation.plant.tip import Clinging, RigidTip
+from tactile_resonance.simulation.plant.tip import OnSoft, RigidTip, clinging
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import QUICK, RADIUS_M, SOFT, contact, started, stiffer
@@ -20,11 +20,11 @@ from contacts import QUICK, RADIUS_M, SOFT, contact, started, stiffer
 PULL_N = Limits().pull_force_n
 
 
-def clinging(pull):
+def held_by(pull):
     made = started()
     assert made.run_until(State.HOLD)
     plant = made.bench.plant
-    held = Clinging(plant._on.indenter, pull)
+    held = OnSoft(plant._on.indenter, clinging(pull))
     held._touched = True
     plant._on = RigidTip(held)
     made.controller.retract()
@@ -33,7 +33,7 @@ def clinging(pull):
 
 
 def test_hook_is_pulled_no_harder_than_accepted_and_the_tip_stays_where_it_is():
-    made, _ = clinging(lambda height_m, _: 40.0 * height_m)
+    made, _ = held_by(lambda height_m, _: 40.0 * height_m)
     assert made.controller.state is State.FAULT
     result = made.controller.result
     assert result.cause is Cause.HELD
@@ -57,7 +57,7 @@ def test_a_zero_that_creeps_holds_the_tip_too_and_the_reason_leaves_that_open():
 
 
 def test_hook_that_is_asked_for_again_is_pulled_a_little_harder_each_time():
-    made, _ = clinging(lambda height_m, _: 40.0 * height_m)
+    made, _ = held_by(lambda height_m, _: 40.0 * height_m)
     for _ in range(5):
         before_n = min(made.force_n)
         made.controller.retract()
@@ -67,8 +67,8 @@ def test_hook_that_is_asked_for_again_is_pulled_a_little_harder_each_time():
 
 
 def test_tip_that_is_freed_is_drawn_back_on_request():
-    made, held = clinging(lambda height_m, _: 40.0 * height_m)
-    held.pull = lambda *_: None
+    made, held = held_by(lambda height_m, _: 40.0 * height_m)
+    held.beside = lambda *_: None
     made.run(0.1)
     made.controller.retract()
     assert made.run_until(State.IDLE, 3.0)
@@ -82,7 +82,7 @@ def test_film_that_pulls_as_fast_as_it_is_drawn_is_left_slowly(damping_ns_per_m)
     def pull(height_m, up_m_s):
         return damping_ns_per_m * max(0.0, up_m_s) if height_m < 2e-3 else None
 
-    made, _ = clinging(pull)
+    made, _ = held_by(pull)
     assert made.controller.state is State.IDLE
     assert made.controller.result.retracted
     assert min(made.force_n) > -5.5e-3
@@ -169,7 +169,7 @@ def test_force_on_the_way_counts_where_the_cell_is_under_the_sample(under_sample
 
 @pytest.mark.parametrize("stiffness", [3.0, 5.0, 8.0])
 def test_soft_hook_is_not_taken_for_a_zero_again_and_again(stiffness):
-    made, _ = clinging(lambda height_m, _: stiffness * height_m)
+    made, _ = held_by(lambda height_m, _: stiffness * height_m)
     made.run(6.0)
     assert made.controller.result.cause is Cause.HELD
     # once it may pass for a zero

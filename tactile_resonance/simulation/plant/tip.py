@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil, sqrt
@@ -17,16 +15,28 @@ from tactile_resonance.simulation.sensor.bimorph import BeamModes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Beam, Indenter, Motion, swing
 
-UP_M = 1e-7
-"""Over which the slope of a pull is taken [m]."""
+UP_M = 1e-9
+"""Over which slopes are taken [m]."""
+
+Beside = Callable[[float, float], float | None]
+"""Force of something else than soft tissue on a ball along the outward normal [N], from its depth below the
+undisturbed surface [m] and its speed upwards [m/s]; None: it lets go until the tissue is touched again."""
 
 
-class OnSoft(ABC):
-    """A ball on soft tissue that something else acts on, too."""
+class OnSoft:
+    """A ball on soft tissue, beside which something else acts on it from the first touch on.
 
-    def __init__(self, soft: Ball) -> None:
-        self._soft = soft
-        self._beside_n = 0.0  # of what else acts
+    Parameters
+    ----------
+    soft : Ball
+    beside : callable
+        What else acts: `bone`, `clinging`.
+    """
+
+    def __init__(self, soft: Ball, beside: Beside) -> None:
+        self.beside = beside
+        self._soft, self._touched = soft, False
+        self._beside_n = 0.0
 
     @property
     def force_n(self) -> float:
@@ -46,22 +56,20 @@ class OnSoft(ABC):
     def step(self, depth_m: float, dt_s: float) -> float:
         """Move the ball to a depth within a time; return the force [N]."""
         up_m_s = (self._soft.depth_m - depth_m) / dt_s
-        self._soft.step(depth_m, dt_s)
-        self._beside_n = self._act(up_m_s)
+        self._touched |= self._soft.step(depth_m, dt_s) > 0
+        acting_n = self.beside(depth_m, up_m_s) if self._touched else None
+        self._touched, self._beside_n = acting_n is not None, acting_n or 0.0
         return self.force_n
 
     def tangent(self, dt_s: float) -> tuple[float, float]:
         """Force after holding for a time [N], and per further depth [N/m]."""
-        (force_n, slope), (beside_n, steeper) = self._soft.tangent(dt_s), self._ahead(dt_s)
-        return force_n + beside_n, slope + steeper
-
-    @abstractmethod
-    def _act(self, up_m_s: float) -> float:
-        """Force of what else acts [N], after a step of the tissue in which the ball rose with a speed."""
-
-    @abstractmethod
-    def _ahead(self, dt_s: float) -> tuple[float, float]:
-        """Its part of `tangent`."""
+        force_n, slope = self._soft.tangent(dt_s)
+        if not self._touched:
+            return force_n, slope
+        depth_m = self._soft.depth_m
+        held_n = self.beside(depth_m, 0.0) or 0.0
+        higher_n = self.beside(depth_m - UP_M, UP_M / dt_s) or 0.0
+        return force_n + held_n, slope + max(0.0, held_n - higher_n) / UP_M
 
     def swing(self, beam: Beam, base: Motion, ball: Motion, h_s: float, count: int) -> Motion:
         """See `Indenter.swing`."""
@@ -73,8 +81,12 @@ class OnSoft(ABC):
         return ball
 
     def stiffness_at(self, depth_m: float) -> float:
-        """See `Indenter.stiffness_at`."""
-        return self._soft.stiffness_at(depth_m)
+        """See `Indenter.stiffness_at`; of all that acts."""
+        soft = self._soft.stiffness_at(depth_m)
+        if depth_m <= 0:
+            return soft
+        higher_n = self.beside(depth_m - UP_M, 0.0) or 0.0
+        return soft + ((self.beside(depth_m, 0.0) or 0.0) - higher_n) / UP_M
 
 
 Ball = Indenter | OnSoft
@@ -83,79 +95,39 @@ Ball = Indenter | OnSoft
 BONE_PA, BONE_POISSON_RATIO = 10e6, 0.3
 
 
-class OnBone(OnSoft):
-    """Soft tissue on an elastic half-space: both press on the ball, the lower from its depth on.
+def bone(layer_m: float, radius_m: float) -> Beside:
+    """Elastic half-space under a layer: both press on the ball, the lower from its depth on.
 
     The layer's force is that of a thick one: on bone a thin one is stiffer (Dimitriadis
     et al., Biophys. J. 82 (2002)), so the ball meets the bone faster here, which is the worse case.
 
     Parameters
     ----------
-    soft : Ball
-        On the layer.
     layer_m : float
         Its thickness [m].
     radius_m : float
         Of the ball.
     """
-
-    def __init__(
-        self,
-        soft: Ball,
-        *,
-        layer_m: float,
-        radius_m: float,
-    ) -> None:
-        require(layer_m >= 0, "layer_m", layer_m, "0 or above")
-        super().__init__(soft)
-        self._layer_m = layer_m
-        self._c = 4 / 3 * BONE_PA / (1 - BONE_POISSON_RATIO**2) * math.sqrt(radius_m)
-
-    def _act(self, up_m_s: float) -> float:
-        return self._ahead(0.0)[0]
-
-    def stiffness_at(self, depth_m: float) -> float:
-        """Of both."""
-        bone = 1.5 * self._c * math.sqrt(max(0.0, depth_m - self._layer_m))
-        return super().stiffness_at(depth_m) + bone
-
-    def _ahead(self, dt_s: float) -> tuple[float, float]:
-        """Force of the bone and its slope (Hertz)."""
-        root = math.sqrt(max(0.0, self._soft.depth_m - self._layer_m))
-        return self._c * root**3, 1.5 * self._c * root
+    require(layer_m >= 0, "layer_m", layer_m, "0 or above")
+    c = 4 / 3 * BONE_PA / (1 - BONE_POISSON_RATIO**2) * sqrt(radius_m)
+    return lambda depth_m, _: c * max(0.0, depth_m - layer_m) ** 1.5
 
 
-class Clinging(OnSoft):
-    """Tissue that, once touched, holds the ball back above its surface: a film, a fibre, a hook.
+def clinging(pull: Callable[[float, float], float | None]) -> Beside:
+    """Tissue that holds the ball back above its surface: a film, a fibre, a hook.
 
     Parameters
     ----------
-    soft : Ball
     pull : callable
         Force [N] from the height of the ball above the surface [m] and its speed upwards [m/s]; None: it lets
         go until the tissue is touched again.
     """
 
-    def __init__(self, soft: Ball, pull: Callable[[float, float], float | None]) -> None:
-        super().__init__(soft)
-        self.pull = pull
-        self._touched = False
+    def beside(depth_m: float, up_m_s: float) -> float | None:
+        pulled_n = 0.0 if depth_m >= 0 else pull(-depth_m, up_m_s)
+        return None if pulled_n is None else -pulled_n
 
-    def _act(self, up_m_s: float) -> float:
-        self._touched |= self._soft.force_n > 0
-        if not self._touched or self._soft.depth_m >= 0:
-            return 0.0
-        pulled_n = self.pull(-self._soft.depth_m, up_m_s)
-        self._touched = pulled_n is not None
-        return -(pulled_n or 0.0)
-
-    def _ahead(self, dt_s: float) -> tuple[float, float]:
-        height_m = -self._soft.depth_m
-        if not self._touched or height_m <= 0:
-            return 0.0, 0.0
-        pulled_n = self.pull(height_m, 0.0) or 0.0
-        further_n = self.pull(height_m + UP_M, UP_M / dt_s) or 0.0
-        return -pulled_n, max(0.0, further_n - pulled_n) / UP_M
+    return beside
 
 
 SUBSTEP_S = 5e-4  # a twentieth of the period of the mode on stiff gelatine
@@ -268,7 +240,7 @@ class Tip:
     adhesion_j_per_m2 : float
         See `Indenter`.
     meets : callable, optional
-        From the ball on the tissue to what it meets: `OnBone`, `Clinging`.
+        From the ball on the tissue to what it meets: `OnSoft`.
     """
 
     radius_m: float = 2.5e-3

@@ -15,10 +15,11 @@ from tactile_resonance.simulation.plant.surfaces import FlatSurface, RoundSurfac
 from tactile_resonance.simulation.plant.tip import (
     BONE_PA,
     BONE_POISSON_RATIO,
-    OnBone,
+    OnSoft,
     RigidTip,
     SprungIndenter,
     Tip,
+    bone,
 )
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
@@ -261,7 +262,7 @@ def test_what_is_elastic_neither_gives_nor_takes_energy_of_a_ball_on_the_beam(el
     ball = Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=NU)
     plane_pa = tissue.relaxation_modulus_1s_pa / (1 - NU**2)
     if elastic_pa is None:
-        ball = OnBone(ball, layer_m=0.0, radius_m=RADIUS_M)
+        ball = OnSoft(ball, bone(0.0, RADIUS_M))
         plane_pa = BONE_PA / (1 - BONE_POISSON_RATIO**2)
     k, m = 14.8, 2.65e-4
     tip = SprungIndenter(ball, stiffness_n_per_m=k, mass_kg=m, damping_ns_per_m=0.0)
