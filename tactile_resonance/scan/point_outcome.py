@@ -204,7 +204,7 @@ def judge_drift(
 ) -> tuple[SensorHealth, str]:
     """Whether the poles in air moved during the scan: beyond their uncertainty and beyond the limits.
 
-    Steady is what would have shown a change by a few limits; with more uncertainty than that nothing is known.
+    Steady is what neither changed by more than a limit nor is less certain than one.
 
     Returns
     -------
@@ -233,8 +233,8 @@ def judge_drift(
             SensorHealth.DRIFTED,
             f"warning: the sensor drifted, poles relative to air are off by as much: {figures}",
         )
-    if np.any(std > most):
-        return SensorHealth.UNKNOWN, f"sensor health unknown, less certain in air than the limits: {figures}"
+    if np.any(np.maximum(std, np.abs(change)) > most):
+        return SensorHealth.UNKNOWN, f"sensor health unknown, noise hides whether it drifted: {figures}"
     return SensorHealth.STEADY, f"sensor steady: {figures}"
 
 
