@@ -193,27 +193,21 @@ def krige(
     Parameters
     ----------
     xy_m : (n, 2) float
-        Positions, n at least `LEAST_POINTS`, not all in one place.
+        Positions, finite as the rest, n at least `LEAST_POINTS`, not all in one place.
     values : (n,) float
     noise_std : (n,) float
-        Of each value; 0 means exact, and where one is, a scatter is not looked for.
+        Of each value, 0 or above; 0 means exact, and where one is, a scatter is not looked for.
     most_length_m, least_std : float
         What is known beforehand of length and size, which few points do not determine.
 
     Raises
     ------
     ValueError
-        If there are too few points, or two exact ones in one place.
+        If there are two exact ones in one place.
     """
     xy, y, noise = (np.asarray(v, float) for v in (xy_m, values, noise_std))
-    require(len(xy) >= LEAST_POINTS, "xy_m", len(xy), f"{LEAST_POINTS} points or more")
-    good = bool(np.all(np.isfinite(xy)) and np.all(np.isfinite(y)))
-    require(good, "xy_m, values", "some that are not finite", "finite numbers")
-    wrong = noise[~((noise >= 0) & np.isfinite(noise))]
-    require(not wrong.size, "noise_std", wrong.tolist()[:1], "finite numbers, 0 or above")
     # of many points the diagonal of all: their distances would take too much memory
     extent = float(np.linalg.norm(np.ptp(xy, axis=0)) if len(xy) > MOST_JOINT else pdist(xy).max())
-    require(extent > 0, "xy_m", "one place", "places apart from each other")
     unit_m = 1e-9 * extent  # what is nearer is one place
     places, place_of = np.unique(np.round(xy / unit_m), axis=0, return_inverse=True)
     exact = place_of.ravel()[noise == 0]

@@ -31,7 +31,6 @@ from tactile_resonance.scan.points import LeftOut, ScanPoint, tip_orientation
 from tactile_resonance.scan.surface import NormalRequest, Surface, TouchRequest, unit_normal
 
 UP = (0.0, 0.0, 1.0)
-FORMS = {"plane": 3, "quadric": 6}
 _IMPROBABLE = 1e-3  # residuals less probable than this are no noise
 _WORST_CONDITION = 1e6
 # Turns of the fit and of the normals along which the ball meets it; each leaves a hundredth of the error.
@@ -116,25 +115,19 @@ def fit_surface(
     Parameters
     ----------
     contacts_m : (n, 3) float
-        Where the surface was found [m].
+        Where the surface was found, as many as the form has terms, or more [m].
     std_m : (n,) float or float
-        Standard deviation of each height [m].
+        Standard deviation of each height, above 0 [m].
     form : str
         plane (three contacts or more) or quadric (six or more).
 
     Raises
     ------
     ValueError
-        If there are too few contacts, or they do not determine the form (on one line, say).
+        If the contacts do not determine the form (on one line, say).
     """
     contacts = np.asarray(contacts_m, float)
-    require(form in FORMS, "form", form, f"one of {', '.join(FORMS)}")
-    terms = FORMS[form]
-    good = contacts.ndim == 2 and contacts.shape[1] == 3 and len(contacts) >= terms
-    require(good, "contacts_m", contacts.shape, f"shape (n, 3), n at least {terms} for a {form}")
-    require(bool(np.all(np.isfinite(contacts))), "contacts_m", "NaN", "finite positions")
     std = np.broadcast_to(np.asarray(std_m, float), len(contacts))
-    require(bool(np.all((std > 0) & np.isfinite(std))), "std_m", std_m, "numbers above 0")
     center = contacts[:, :2].mean(axis=0)
     scale = float(np.max(np.abs(contacts[:, :2] - center)))
     require(scale > 0, "contacts_m", "one position", "positions apart from each other")
@@ -150,7 +143,7 @@ def fit_surface(
     coefficients = inverse @ (contacts[:, 2] / std)
     covariance = inverse @ inverse.T
     weighted = contacts[:, 2] / std - design @ coefficients
-    spare = len(contacts) - terms
+    spare = len(contacts) - coefficients.size
     cost, consistent = float(weighted @ weighted), True
     if spare > 0:
         consistent = bool(special.chdtrc(spare, cost) >= _IMPROBABLE)

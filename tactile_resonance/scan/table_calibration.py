@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.contact.vectors import Six, Vector
+from tactile_resonance.contact.vectors import Six
 from tactile_resonance.fields import (
     build,
     check_above_zero,
@@ -302,10 +302,4 @@ def read_table(path: Path, base_frame: str) -> list[float]:
 @dataclass(frozen=True)
 class _Table:
     table_in_base: Six
-    covariance: tuple[Vector, Vector, Vector]
     base_frame: str
-
-    def __post_init__(self) -> None:
-        for index, row in enumerate(self.covariance):
-            name = f"covariance[{index}][{index}]"
-            require(row[index] > 0, name, row[index], "a variance above 0")

@@ -43,15 +43,6 @@ class TissueClass:
     def __post_init__(self) -> None:
         good = bool(self.name) and self.name != UNKNOWN
         require(good, "name", self.name, f"a name other than {UNKNOWN!r}")
-        good = self.mean.shape == (2,) and bool(np.all(np.isfinite(self.mean)))
-        require(good, "mean", self.mean.tolist(), "f0 [Hz] and damping ratio")
-        good = self.spread.shape == (2, 2) and bool(np.all(np.isfinite(self.spread)))
-        require(good, "spread", self.spread.tolist(), "a finite 2 x 2 matrix")
-        least = float(np.linalg.eigvalsh(self.spread / _unit(self.spread))[0])
-        good = bool(np.allclose(self.spread, self.spread.T)) and least >= -1e-9
-        require(good, "spread", self.spread.tolist(), "a covariance: symmetric, not negative")
-        good = self.degrees_of_freedom > 0
-        require(good, "degrees_of_freedom", self.degrees_of_freedom, "a number above 0")
         require(0 < self.prior < np.inf, "prior", self.prior, "a number above 0")
 
 
@@ -139,18 +130,12 @@ def classify(
     covariance : (2, 2) float
         Of the estimate.
     classes : sequence of TissueClass
+        One or more, of different names.
     unknown_level : float
-        A pole farther from every class than this fraction of the class's own members is `UNKNOWN`.
-
-    Raises
-    ------
-    ValueError
-        If there is no class, or two share a name.
+        A pole farther from every class than this fraction of the class's own members is `UNKNOWN`; above 0,
+        below 1.
     """
     names = [c.name for c in classes]
-    require(bool(names), "classes", names, "one class or more")
-    require(len(set(names)) == len(names), "classes", names, "names that differ")
-    require(0 < unknown_level < 1, "unknown_level", unknown_level, "between 0 and 1")
     x, noise = np.asarray(estimate, float), np.asarray(covariance, float)
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(noise))):
         return TissueCall(UNKNOWN, float("nan"), "no pole with a covariance")

@@ -75,7 +75,7 @@ def differences_from_rest(
     Raises
     ------
     ValueError
-        If a shape does not fit, something is not finite, or a covariance is not positive definite.
+        If a covariance is not positive definite.
 
     Notes
     -----
@@ -137,14 +137,6 @@ def _checked(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Estimates, covariances and spread as arrays."""
     x, c, w = (np.asarray(each, float) for each in (estimates, covariances, spread))
-    n = len(x)
-    for name, array, shape in (
-        ("estimates", x, (n, 2)),
-        ("covariances", c, (n, 2, 2)),
-        ("spread", w, (2, 2)),
-    ):
-        good = array.shape == shape and n > 0 and bool(np.all(np.isfinite(array)))
-        require(good, name, array.shape, f"shape {shape}, finite, of one point or more")
     total = c + w
     above = (total[:, 0, 0] > 0) & (np.linalg.det(total) > 0)
     require(bool(above.all()), "covariances", c[~above][:1].tolist(), "positive definite ones, with the spread")
@@ -237,7 +229,7 @@ def find_clusters(
     Raises
     ------
     ValueError
-        If a shape does not fit, something is not finite, or a covariance is not positive definite.
+        If a covariance is not positive definite.
     """
     given = np.zeros((2, 2)) if spread is None else spread
     x, noise, own = _checked(estimates, covariances, given)

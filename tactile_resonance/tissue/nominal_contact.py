@@ -42,12 +42,6 @@ class ForceSensitivity:
     per_n: FloatArray
     covariance: FloatArray
 
-    def __post_init__(self) -> None:
-        good = self.per_n.shape == (2,) and bool(np.all(np.isfinite(self.per_n)))
-        require(good, "per_n", self.per_n.tolist(), "[Hz/N] and [1/N]")
-        good = self.covariance.shape == (2, 2) and bool(np.all(np.isfinite(self.covariance)))
-        require(good, "covariance", self.covariance.tolist(), "a finite 2 x 2 matrix")
-
 
 @dataclass(frozen=True)
 class ContactLoad:

@@ -58,16 +58,6 @@ class ReferencePoints:
     position: Texts
     run: Texts
 
-    def __post_init__(self) -> None:
-        n = len(self.estimate)
-        shapes = {"estimate": (n, 2), "covariance": (n, 2, 2), "measured": (n, 2, 2)}
-        for item in fields(self):
-            array, shape = getattr(self, item.name), shapes.get(item.name, (n,))
-            good = array.shape == shape and (
-                item.name not in shapes or bool(np.all(np.isfinite(array)))
-            )
-            require(good, item.name, array.shape, f"shape {shape}, finite")
-
     def where(self, chosen: BoolArray) -> ReferencePoints:
         """Those chosen."""
         return ReferencePoints(*(getattr(self, item.name)[chosen] for item in fields(self)))

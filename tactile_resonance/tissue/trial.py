@@ -121,7 +121,6 @@ def call_points(
     points: ReferencePoints, classes: Sequence[TissueClass], unknown_level: float
 ) -> Trial:
     """Call each point by classes, as `classify` does."""
-    require(0 < unknown_level < 1, "unknown_level", unknown_level, "between 0 and 1")
     names = np.array([each.name for each in classes])
     probability, tails = posteriors(points.estimate, points.covariance, classes)
     likely, tail = names[np.argmax(probability, axis=1)], tails.max(axis=1)
