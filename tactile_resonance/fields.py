@@ -4,7 +4,8 @@
 The one reader of files, and of plain values from elsewhere: the annotations of a frozen dataclass say what a
 file may hold, `read_file` or `read` makes it from the content, and its ``__post_init__`` checks ranges. Kinds
 of fields: float (finite), int, bool, str, enumerations (by value), ``Literal``, dataclasses, tuples, mappings,
-arrays of numbers, each of these or None, and ``Annotated[KIND, read_it]``: ``read_it(value, field)`` reads it.
+arrays of numbers, each of these or None, ``Annotated[KIND, read_it]``: ``read_it(value, field)`` reads it, and
+numbers of a `Range` (`Checked`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import (
     Annotated,
     Any,
     Literal,
+    NamedTuple,
     TypeVar,
     Union,
     cast,
@@ -61,25 +63,31 @@ def require_kind(value: object, field: str, *kinds: type) -> None:
         raise ValueError(f"{field}: got a {type(value).__name__}; accepted is a {names}")
 
 
-def check_within(owner: object, **ranges: tuple[float, float]) -> None:
-    """`require` each named number of a dataclass to be in its range, ends included; None passes."""
-    for name, (low, high) in ranges.items():
-        value = getattr(owner, name)
-        require(value is None or low <= value <= high, name, value, f"{low:g} to {high:g}")
+class Range(NamedTuple):
+    """Between which ends, included, the number of a field is: ``Annotated[KIND, Range(low, high)]``."""
+
+    low: float
+    high: float
+    words: str = ""
 
 
-def check_above_zero(owner: object, *names: str) -> None:
-    """`require` each named number of a dataclass to be above 0 and finite; None passes."""
-    for name in names:
-        value = getattr(owner, name)
-        require(value is None or 0 < value < math.inf, name, value, "a number above 0")
+AboveZero = Annotated[float, Range(math.ulp(0.0), sys.float_info.max, "a number above 0")]
+NotNegative = Annotated[float, Range(0.0, sys.float_info.max, "a number, 0 or above")]
+BelowOne = Annotated[
+    float, Range(math.ulp(0.0), math.nextafter(1.0, 0.0), "a number above 0, below 1")
+]
+Seed = Annotated[int, Range(0, math.inf, "a number, 0 or above")]
 
 
-def check_not_negative(owner: object, *names: str) -> None:
-    """`require` each named number of a dataclass to be 0 or above and finite; None passes."""
-    for name in names:
-        value = getattr(owner, name)
-        require(value is None or 0 <= value < math.inf, name, value, "a number, 0 or above")
+class Checked:
+    """A dataclass whose numbers are, as it is made, within the `Range` of their fields; None passes."""
+
+    def __post_init__(self) -> None:
+        for name, _, _, of in _fields(cast(Any, type(self))).values():
+            value = getattr(self, name)
+            if of is not None and value is not None:
+                words = of.words or f"{of.low:g} to {of.high:g}"
+                require(of.low <= value <= of.high, name, value, words)
 
 
 def cut(text: str) -> str:
@@ -256,7 +264,7 @@ def read_dataclass(cls: type[T], mapping: Any, where: str, **given: object) -> T
     wanted = {key: of for key, of in _fields(cast(Any, cls)).items() if of[0] not in given}
     known_keys(mapping, set(wanted), where)
     values = dict(given)
-    for key, (name, kind, optional) in wanted.items():
+    for key, (name, kind, optional, _) in wanted.items():
         if key in mapping:
             values[name] = read(kind, mapping[key], join(where, key))
         else:
@@ -328,22 +336,23 @@ def _inside(where: str) -> str:
 
 
 @cache
-def _fields(cls: type) -> dict[str, tuple[str, Any, bool]]:
-    """By key: name and kind of each field of a dataclass, and whether it may be left out.
+def _fields(cls: type) -> dict[str, tuple[str, Any, bool, Range | None]]:
+    """By key: name and kind of each field of a dataclass, whether it may be left out, and its range.
 
     Names are keys, but for a last ``_`` that distinguishes them from Python's own words.
     """
-    hints = get_type_hints(cls, include_extras=True)
-    nothing = dataclasses.MISSING
-    return {
-        f.name.rstrip("_"): (
-            f.name,
-            hints[f.name],
-            f.default is not nothing or f.default_factory is not nothing,
-        )
-        for f in dataclasses.fields(cls)
-        if f.init
-    }
+    hints, bare = get_type_hints(cls, include_extras=True), get_type_hints(cls)
+    found, nothing = {}, dataclasses.MISSING
+    for f in dataclasses.fields(cls):
+        kind, of = hints[f.name], None
+        for each in (kind, *get_args(kind)):  # of those that may be None, too
+            for mark in getattr(each, "__metadata__", ()):
+                if isinstance(mark, Range):
+                    kind, of = bare[f.name], mark
+        optional = f.default is not nothing or f.default_factory is not nothing
+        if f.init:
+            found[f.name.rstrip("_")] = (f.name, kind, optional, of)
+    return found
 
 
 def _mapping(value: object, field: str) -> Mapping[str, Any]:

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import (
-    check_above_zero,
-    check_not_negative,
-    check_within,
+    AboveZero,
+    BelowOne,
+    Checked,
+    NotNegative,
+    Range,
     read_file,
     require,
 )
@@ -23,56 +26,41 @@ MAX_LEVEL_V = 4.0
 
 
 @dataclass(frozen=True)
-class BeamParameters:
+class BeamParameters(Checked):
     """Symmetric three-layer cantilever (piezo, shim, piezo); one layer drives, the other senses."""
 
-    free_length_m: float
-    width_m: float
-    piezo_thickness_m: float
-    shim_thickness_m: float
-    piezo_modulus_pa: float
-    shim_modulus_pa: float
-    piezo_density_kg_per_m3: float
-    shim_density_kg_per_m3: float
+    free_length_m: AboveZero
+    width_m: AboveZero
+    piezo_thickness_m: AboveZero
+    shim_thickness_m: AboveZero
+    piezo_modulus_pa: AboveZero
+    shim_modulus_pa: AboveZero
+    piezo_density_kg_per_m3: AboveZero
+    shim_density_kg_per_m3: AboveZero
     d31_m_per_v: float
-    relative_permittivity_t33: float
-    modal_damping_ratio: float
-    mode_count: int
+    relative_permittivity_t33: AboveZero
+    modal_damping_ratio: BelowOne
+    mode_count: Annotated[int, Range(1, 40)]
 
     def __post_init__(self) -> None:
-        check_above_zero(
-            self, "free_length_m", "width_m", "piezo_thickness_m", "shim_thickness_m",
-            "piezo_modulus_pa", "shim_modulus_pa", "piezo_density_kg_per_m3",
-            "shim_density_kg_per_m3", "relative_permittivity_t33",
-        )  # fmt: skip
+        super().__post_init__()
         require(self.d31_m_per_v != 0.0, "d31_m_per_v", self.d31_m_per_v, "a number other than 0")
-        zeta = self.modal_damping_ratio
-        require(0.0 < zeta < 1.0, "modal_damping_ratio", zeta, "above 0 and below 1")
-        check_within(self, mode_count=(1, 40))
 
 
 @dataclass(frozen=True)
-class TipParameters:
+class TipParameters(Checked):
     """Spherical tip at the free end; `mass_kg` may be 0 for a bare cantilever."""
 
-    radius_m: float
-    mass_kg: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "radius_m")
-        check_not_negative(self, "mass_kg")
+    radius_m: AboveZero
+    mass_kg: NotNegative
 
 
 @dataclass(frozen=True)
-class ElectricParameters:
+class ElectricParameters(Checked):
     """Load of the sensing layer and capacitive feedthrough ``gamma = Cs / (Cp + Cs)``."""
 
-    input_resistance_ohm: float
-    feedthrough: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "input_resistance_ohm")
-        require(0.0 < self.feedthrough < 1.0, "feedthrough", self.feedthrough, "above 0, below 1")
+    input_resistance_ohm: AboveZero
+    feedthrough: BelowOne
 
 
 @dataclass(frozen=True)
@@ -86,23 +74,18 @@ class NonlinearParameters:
 
 
 @dataclass(frozen=True)
-class AcquisitionParameters:
+class AcquisitionParameters(Checked):
     """Noise and converters.
 
     Noise is white: its rms scales with the square root of half the sample rate over
     `sensor_noise_bandwidth_hz`. The drive passes `actuator_divider` before its converter.
     """
 
-    sensor_noise_v: float
-    sensor_noise_bandwidth_hz: float
-    adc_bits: int
-    adc_range_v: float
-    actuator_divider: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_not_negative(self, "sensor_noise_v")
-        check_above_zero(self, "sensor_noise_bandwidth_hz", "adc_range_v", "actuator_divider")
-        check_within(self, adc_bits=(8, 31))
+    sensor_noise_v: NotNegative
+    sensor_noise_bandwidth_hz: AboveZero
+    adc_bits: Annotated[int, Range(8, 31)]
+    adc_range_v: AboveZero
+    actuator_divider: AboveZero = 1.0
 
     def noise_rms_v(self, sample_rate_hz: float) -> float:
         """Return the rms of the sensor noise [V] in the full band of a sample rate."""

@@ -28,8 +28,9 @@ import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.fields import (
-    check_above_zero,
-    check_not_negative,
+    AboveZero,
+    Checked,
+    NotNegative,
     known,
     read_dataclass,
     read_yaml,
@@ -341,19 +342,19 @@ def read_calibration(path: Path) -> CalibratedSensor:
 
 
 @dataclass(frozen=True, eq=False)
-class _File:
-    tip_radius_m: float
+class _File(Checked):
+    tip_radius_m: AboveZero
     band_hz: tuple[float, float]
-    noise_v_per_root_hz: float | None
-    excess: float
+    noise_v_per_root_hz: AboveZero | None
+    excess: AboveZero
     message: str
     natural_rad_s: FloatArray
     damping_ratio: FloatArray
     coupling_rad_s: FloatArray
     tip_deflection: FloatArray
     feedthrough: float
-    leak_rad_s: float
-    gain: float
+    leak_rad_s: NotNegative
+    gain: AboveZero
     delay_s: float
     determined: tuple[bool, ...]
     covariance: FloatArray
@@ -361,8 +362,7 @@ class _File:
     tip_mass_std_kg: float | None = None
 
     def __post_init__(self) -> None:
-        check_above_zero(self, "tip_radius_m", "noise_v_per_root_hz", "excess", "gain")
-        check_not_negative(self, "leak_rad_s")
+        super().__post_init__()
         modes = self.natural_rad_s.size
         require(modes > 0, "natural_rad_s", [], "a list of one mode or more")
         for name in PER_MODE:

@@ -12,19 +12,19 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import Six, six
-from tactile_resonance.fields import check_within
+from tactile_resonance.fields import Checked, Range
 
 if TYPE_CHECKING:  # it needs the kinds of mounts
     from tactile_resonance.contact.payload import Mounting
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommandLimits:
+class CommandLimits(Checked):
     """What the configuration of every arm allows of a command; faster ones are refused.
 
     Attributes
@@ -35,17 +35,9 @@ class CommandLimits:
         Of a command or a stop [m/s2].
     """
 
-    max_speed_m_s: float = 0.25
-    max_turn_rad_s: float = 1.0
-    max_acceleration_m_s2: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_within(
-            self,
-            max_speed_m_s=(1e-4, 1.5),
-            max_turn_rad_s=(1e-4, math.pi),
-            max_acceleration_m_s2=(1e-3, 20.0),
-        )
+    max_speed_m_s: Annotated[float, Range(1e-4, 1.5)] = 0.25
+    max_turn_rad_s: Annotated[float, Range(1e-4, math.pi)] = 1.0
+    max_acceleration_m_s2: Annotated[float, Range(1e-3, 20.0)] = 2.0
 
 
 def checked_twist(twist: Sequence[float], limits: CommandLimits) -> Six:

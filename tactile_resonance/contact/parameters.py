@@ -13,7 +13,7 @@ import numpy as np
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.vectors import rotated
-from tactile_resonance.fields import build, check_within, read_file, require
+from tactile_resonance.fields import build, read_file, require
 
 if TYPE_CHECKING:  # it needs the limits
     from tactile_resonance.contact.geometry import TipGeometry
@@ -31,8 +31,9 @@ def ranges_of(kind: Any) -> dict[str, tuple[float, float, str]]:
 
 def check_ranges(owner: Any) -> None:
     """Raise ``ValueError`` naming the first number of a dataclass that is out of its range."""
-    ranges = ranges_of(owner).items()
-    check_within(owner, **{name: (low, high) for name, (low, high, _) in ranges})
+    for name, (low, high, _) in ranges_of(owner).items():
+        value = getattr(owner, name)
+        require(low <= value <= high, name, value, f"{low:g} to {high:g}")
 
 
 EARLY_SHARE = 0.8

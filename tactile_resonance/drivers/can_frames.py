@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated
 
 from tactile_resonance.configuration import shared_file
-from tactile_resonance.fields import check_above_zero, check_within, read, read_file, require
+from tactile_resonance.fields import Checked, Range, read, read_file, require
 
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 
@@ -50,7 +50,7 @@ class CellCommand:
 
 
 @dataclass(frozen=True)
-class Reply:
+class Reply(Checked):
     """Where an answer says whether the command was done.
 
     Attributes
@@ -63,13 +63,10 @@ class Reply:
         Reasons in words.
     """
 
-    result_byte: int
-    good: int
-    error_byte: int
+    result_byte: Annotated[int, Range(0, 255)]
+    good: Annotated[int, Range(0, 255)]
+    error_byte: Annotated[int, Range(0, 255)]
     errors: Mapping[int, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        check_within(self, result_byte=(0, 255), good=(0, 255), error_byte=(0, 255))
 
 
 @dataclass(frozen=True)
@@ -112,7 +109,7 @@ class Overload:
 
 
 @dataclass(frozen=True)
-class CanDescription:
+class CanDescription(Checked):
     """Frames and commands of one make of cell; see ``config/force/frames``.
 
     Attributes
@@ -144,7 +141,7 @@ class CanDescription:
     constant: Mapping[str, int] = field(default_factory=dict)
     overload: Overload | None = None
     invalid_counts: tuple[int, ...] = ()
-    full_scale_counts: int | None = None
+    full_scale_counts: Annotated[int, Range(1, 2**63, "a number above 0")] | None = None
     commands: CellCommands = field(default_factory=lambda: CellCommands(id=0))
 
     def __post_init__(self) -> None:
@@ -163,7 +160,7 @@ class CanDescription:
         if self.overload is not None:
             name = self.overload.field
             require(name in self.fields, "overload.field", name, "one of fields")
-        check_above_zero(self, "full_scale_counts")
+        super().__post_init__()
         command_id, reply = self.commands.id, self.commands.reply
         require(0 <= command_id <= most, "commands.id", command_id, f"0 to {most:#x}")
         for name in ("result_byte", "error_byte") if reply else ():

@@ -31,10 +31,11 @@ from tactile_resonance.contact.samples import ArmSample, CellSample
 from tactile_resonance.contact.vectors import Six, rotated_back, turn_from_vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description
 from tactile_resonance.fields import (
+    AboveZero,
+    Checked,
     FileName,
+    Range,
     build,
-    check_above_zero,
-    check_within,
     read,
     read_dataclass,
     read_file_name,
@@ -43,6 +44,7 @@ from tactile_resonance.fields import (
 )
 
 LONGEST_S = 1.0
+Delay = Annotated[float, Range(0.0, LONGEST_S)]
 """Of delays: with more, no contact is controlled."""
 
 
@@ -83,19 +85,18 @@ class ForceConfig(Mounting):
     """
 
     kind: str
-    rate_hz: float
-    noise_rms_n: float
-    range_n: float
-    range_nm: float
+    rate_hz: AboveZero
+    noise_rms_n: AboveZero
+    range_n: AboveZero
+    range_nm: AboveZero
     name: str = ""
-    latency_s: float = 0.0
+    latency_s: Delay = 0.0
     limits: CellLimits = field(default_factory=CellLimits)
-    resolution_n: float | None = None
+    resolution_n: AboveZero | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_above_zero(self, "rate_hz", "noise_rms_n", "range_n", "range_nm", "resolution_n")
-        check_within(self, latency_s=(0, LONGEST_S))
+        Checked.__post_init__(self)
         good = self._step_n is not None
         require(good, "resolution_n", None, "a number above 0: not known of this source")
         silent_s = self.limits.silent_s
@@ -153,12 +154,12 @@ class CanForce(ForceConfig):
     bus: Annotated[dict[str, Any], _read_bus]
     frames: FileName
     description: CanDescription
-    counts_per_n: float | None = None
-    counts_per_nm: float | None = None
+    counts_per_n: AboveZero | None = None
+    counts_per_nm: AboveZero | None = None
     matrix: tuple[Six, Six, Six, Six, Six, Six] | None = None
     stamps: Literal["adapter", "arrival"] = "arrival"
-    shortest_delay_s: float = 0.0
-    delay_std_s: float = 0.0
+    shortest_delay_s: Delay = 0.0
+    delay_std_s: Delay = 0.0
 
     def __post_init__(self) -> None:
         if self.matrix is not None:
@@ -171,8 +172,6 @@ class CanForce(ForceConfig):
             value = getattr(self, name)
             good = (value is None) == (self.matrix is not None)
             require(good, name, value, "a number above 0, or a matrix in place of both")
-        check_above_zero(self, "counts_per_n", "counts_per_nm")
-        check_within(self, shortest_delay_s=(0, LONGEST_S), delay_std_s=(0, LONGEST_S))
         super().__post_init__()
         rates = self.description.commands.rates
         good = not rates or self.rate_hz in rates

@@ -29,7 +29,8 @@ from tactile_resonance.drivers.acquisition import (
     DeviceInfo,
 )
 from tactile_resonance.fields import (
-    check_above_zero,
+    AboveZero,
+    Checked,
     known_keys,
     number,
     one_line,
@@ -51,30 +52,30 @@ TERMINALS = {
 
 
 @dataclass(frozen=True)
-class InputChannel:
+class InputChannel(Checked):
     """One analogue input: its name, half its range [V], and a key of `TERMINALS`."""
 
     channel: str
-    range_v: float
+    range_v: AboveZero
     terminals: str
 
     def __post_init__(self) -> None:
         require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ai0")
-        check_above_zero(self, "range_v")
+        super().__post_init__()
         good = self.terminals in TERMINALS
         require(good, "terminals", self.terminals, f"one of {', '.join(TERMINALS)}")
 
 
 @dataclass(frozen=True)
-class OutputChannel:
+class OutputChannel(Checked):
     """The analogue output: its name, and the largest voltage of either sign that may be put out."""
 
     channel: str
-    max_voltage_v: float
+    max_voltage_v: AboveZero
 
     def __post_init__(self) -> None:
         require(bool(self.channel), "channel", self.channel, "a name such as Dev1/ao0")
-        check_above_zero(self, "max_voltage_v")
+        super().__post_init__()
 
 
 def _read_actuator(value: Any, field: str) -> InputChannel | None:
@@ -92,7 +93,7 @@ def _read_delay(value: object, field: str) -> float:
 
 
 @dataclass(frozen=True)
-class NiDaqConfig:
+class NiDaqConfig(Checked):
     """What `NiDaqDevice` needs to know; see ``config/devices/nidaqmx.yaml``.
 
     Attributes
@@ -115,7 +116,7 @@ class NiDaqConfig:
     actuator: Annotated[InputChannel | None, _read_actuator]
     sensor: InputChannel
     between_samples: BetweenSamples
-    buffer_s: float
+    buffer_s: AboveZero
     anti_alias_filter: str = ""
     channel_delay_s: Annotated[float, _read_delay] = math.nan
     clock_device: str = ""
@@ -123,7 +124,7 @@ class NiDaqConfig:
     def __post_init__(self) -> None:
         taken = self.actuator is not None and self.actuator.channel == self.sensor.channel
         require(not taken, "sensor.channel", self.sensor.channel, "another than actuator.channel")
-        check_above_zero(self, "buffer_s")
+        super().__post_init__()
 
     @property
     def inputs(self) -> list[InputChannel]:

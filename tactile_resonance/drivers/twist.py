@@ -11,7 +11,7 @@ import re
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from tactile_resonance.contact.vectors import (
     turn_product,
     vector_from_turn,
 )
-from tactile_resonance.fields import check_within, require
+from tactile_resonance.fields import Range, require
 
 TOPIC = r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*"
 """As in ROS 2, without substitutions (https://design.ros2.org/articles/topic_and_service_names.html)."""
@@ -63,11 +63,11 @@ class TwistConfig(CommandLimits):
     command_topic: str
     pose_topic: str
     tip_in_tool: PoseOfSix
-    rate_hz: float = 500.0
-    max_state_age_s: float = 0.020
-    max_command_gap_s: float = 0.040
-    follow_s: float = 0.100
-    follow_m: float = 1e-3
+    rate_hz: Annotated[float, Range(25.0, 1000.0)] = 500.0
+    max_state_age_s: Annotated[float, Range(0.002, 0.2)] = 0.020
+    max_command_gap_s: Annotated[float, Range(0.004, 0.5)] = 0.040
+    follow_s: Annotated[float, Range(0.005, 0.5)] = 0.100
+    follow_m: Annotated[float, Range(1e-4, 0.01)] = 1e-3
     lockstep: bool = False
 
     def __post_init__(self) -> None:
@@ -78,14 +78,6 @@ class TwistConfig(CommandLimits):
             require(good, name, value, "the name of a topic: letters, digits, _ and single /")
         accepted = "another topic than command_topic"
         require(self.pose_topic != self.command_topic, "pose_topic", self.pose_topic, accepted)
-        check_within(
-            self,
-            rate_hz=(25.0, 1000.0),
-            max_state_age_s=(0.002, 0.2),
-            max_command_gap_s=(0.004, 0.5),
-            follow_s=(0.005, 0.5),
-            follow_m=(1e-4, 0.01),
-        )
         least = 1 / self.rate_hz
         for name in ("max_state_age_s", "max_command_gap_s", "follow_s"):
             value = getattr(self, name)

@@ -6,11 +6,11 @@ from __future__ import annotations
 import ipaddress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from tactile_resonance.contact.interfaces import CommandLimits
 from tactile_resonance.contact.samples import Pose, PoseOfSix
-from tactile_resonance.fields import check_within, read_file, require
+from tactile_resonance.fields import Range, read_file, require
 
 
 @dataclass(frozen=True)
@@ -49,30 +49,23 @@ class UrArmConfig(CommandLimits):
 
     host: str
     tip_in_flange: PoseOfSix = field(default_factory=Pose.at_origin)
-    payload_kg: float | None = None
+    payload_kg: Annotated[float, Range(0.0, 50.0)] | None = None
     payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rate_hz: float = 500.0
+    rate_hz: Annotated[float, Range(25.0, 500.0)] = 500.0
     watchdog_hz: float = 25.0
-    max_state_age_s: float = 0.020
-    owner_timeout_s: float = 0.100
-    connect_timeout_s: float = 15.0
+    max_state_age_s: Annotated[float, Range(0.004, 1.0)] = 0.020
+    owner_timeout_s: Annotated[float, Range(0.005, 1.0)] = 0.100
+    connect_timeout_s: Annotated[float, Range(1.0, 120.0)] = 15.0
     check_dashboard: bool = True
-    realtime_priority: int = 0
+    realtime_priority: Annotated[int, Range(0, 99)] = 0
     kind: Literal["ur"] = "ur"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require(bool(self.host), "host", self.host, "a name or an address")
-        check_within(
-            self,
-            rate_hz=(25.0, 500.0),
-            watchdog_hz=(5.0 if self.simulated else 25.0, 125.0),
-            max_state_age_s=(0.004, 1.0),
-            owner_timeout_s=(0.005, 1.0),
-            connect_timeout_s=(1.0, 120.0),
-            realtime_priority=(0, 99),
-            payload_kg=(0.0, 50.0),
-        )
+        least = 5.0 if self.simulated else 25.0
+        good = least <= self.watchdog_hz <= 125.0
+        require(good, "watchdog_hz", self.watchdog_hz, f"{least:g} to 125")
         for name, values in (
             ("payload_cog_m", self.payload_cog_m),
             ("tip_in_flange", self.tip_in_flange.vector.tolist()),

@@ -6,15 +6,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import Annotated
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray, IntArray
-from tactile_resonance.fields import check_above_zero, check_within, require
+from tactile_resonance.fields import AboveZero, Checked, Range, require
 
 
 @dataclass(frozen=True)
-class BallTip:
+class BallTip(Checked):
     """What presses.
 
     Attributes
@@ -26,15 +27,9 @@ class BallTip:
         Between robot and ball; infinite where it is held rigidly.
     """
 
-    radius_m: float
-    poisson_ratio: float = 0.49
-    stiffness_n_per_m: float = np.inf
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "radius_m")
-        stiffness = self.stiffness_n_per_m
-        require(stiffness > 0, "stiffness_n_per_m", stiffness, "a number above 0")
-        check_within(self, poisson_ratio=(0, 0.5))
+    radius_m: AboveZero
+    poisson_ratio: Annotated[float, Range(0, 0.5)] = 0.49
+    stiffness_n_per_m: Annotated[float, Range(math.ulp(0.0), math.inf, "a number above 0")] = math.inf
 
     @property
     def factor(self) -> float:

@@ -25,7 +25,7 @@ from tactile_resonance.contact.result import (
     refusal_cause,
 )
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.fields import check_not_negative
+from tactile_resonance.fields import require
 from tactile_resonance.mechanics.indentation import BallTip, Protocol
 from tactile_resonance.nodes import contact_settings
 from tactile_resonance.nodes.contact_thread import ContactThread
@@ -98,7 +98,9 @@ class IndentConduct:
     ) -> None:
         self._request, self._base_frame = request, base_frame
         protocol = key_of(PROTOCOLS, request.protocol, "protocol")
-        check_not_negative(request, "hold_s", "press_speed_m_s", "unload_speed_m_s")
+        for name in ("hold_s", "press_speed_m_s", "unload_speed_m_s"):
+            value = getattr(request, name)
+            require(0 <= value < math.inf, name, value, "a number, 0 or above")
         if protocol is Protocol.INDENTATION and not request.unload_speed_m_s:
             raise ValueError("unload_speed_m_s: 0, accepted with INDENTATION is a speed above 0")
         hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION

@@ -17,16 +17,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.fields import (
+    AboveZero,
+    Checked,
+    Range,
     build,
-    check_above_zero,
-    check_within,
     one_of,
     read_dataclass,
     require,
@@ -50,13 +51,10 @@ _STEPS = 50  # in which the first touches are spread
 
 
 @dataclass(frozen=True)
-class WantedMap:
+class WantedMap(Checked):
     """Wanted: f0 everywhere with this standard deviation; the loss is the variance above it."""
 
-    f0_std_hz: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "f0_std_hz")
+    f0_std_hz: AboveZero
 
     def loss(self, f0_hz: FloatArray, std_hz: FloatArray) -> FloatArray:
         """(...) per area."""
@@ -76,7 +74,7 @@ class WantedMap:
 
 
 @dataclass(frozen=True, eq=False)
-class Adaptive:
+class Adaptive(Checked):
     """Which touches a scan may choose, and what for.
 
     Attributes
@@ -97,15 +95,16 @@ class Adaptive:
 
     polygon_m: FloatArray
     wanted: LevelSet | WantedMap
-    most: int
-    smallest_m: float
+    most: Annotated[int, Range(LEAST_POINTS, MOST_TOUCHES)]
+    smallest_m: AboveZero
     start: int = 9
-    spacing_m: float = 0.001
+    spacing_m: AboveZero = 0.001
     most_loss: float = 0.0
 
     def __post_init__(self) -> None:
-        check_above_zero(self, "spacing_m", "smallest_m")
-        check_within(self, most=(LEAST_POINTS, MOST_TOUCHES), start=(LEAST_POINTS, self.most))
+        super().__post_init__()
+        good = LEAST_POINTS <= self.start <= self.most
+        require(good, "start", self.start, f"{LEAST_POINTS} to {self.most}")
 
     @cached_property
     def raster(self) -> Raster:
@@ -264,13 +263,10 @@ def read_adaptive(value: Mapping[str, Any], classes: Sequence[TissueClass], wher
 
 
 @dataclass(frozen=True)
-class _Boundary:
-    area_m2: float
-    f0_hz: float | None = None
+class _Boundary(Checked):
+    area_m2: AboveZero
+    f0_hz: AboveZero | None = None
     between: tuple[str, str] | None = None
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "area_m2", "f0_hz")
 
     def level_set(self, classes: Mapping[str, float]) -> LevelSet:
         one = (self.f0_hz is None) != (self.between is None)
@@ -286,12 +282,9 @@ class _Boundary:
 
 
 @dataclass(frozen=True)
-class _Tissue:
+class _Tissue(Checked):
     name: str
-    area_m2: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "area_m2")
+    area_m2: AboveZero
 
     def level_set(self, classes: Mapping[str, float]) -> LevelSet:
         accepted = f"one out of two or more tissue_classes: {sorted(classes)}"

@@ -6,11 +6,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import Annotated
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.fields import check_above_zero, check_within, require
+from tactile_resonance.fields import AboveZero, Checked, Range, require
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.hands import Measured, PointFailed
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
@@ -49,17 +50,14 @@ class BlockLimits:
 
 
 @dataclass(frozen=True)
-class Precise:
+class Precise(Checked):
     """Standard deviations asked for; None: as it comes.
 
     They are those of the total covariance where it is known, else of that from noise.
     """
 
-    f0_std_hz: float | None = None
-    damping_ratio_std: float | None = None
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "f0_std_hz", "damping_ratio_std")
+    f0_std_hz: AboveZero | None = None
+    damping_ratio_std: AboveZero | None = None
 
     def verdict(
         self, estimate: FloatArray, covariance: FloatArray, noise: FloatArray, blocks: int, limits: BlockLimits
@@ -230,7 +228,7 @@ def decide(
 
 
 @dataclass(frozen=True)
-class Gate:
+class Gate(Checked):
     """How quiet the force must be while a point is measured.
 
     The blocks of a measurement are one record from rest, whose transient is estimated along: none can be left
@@ -247,14 +245,9 @@ class Gate:
         Most that are begun in one contact.
     """
 
-    force_rms_n: float
-    force_error_n: float = math.inf
-    measurements: int = 20
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "force_rms_n")
-        require(self.force_error_n > 0, "force_error_n", self.force_error_n, "a number above 0")
-        check_within(self, measurements=(1, 100))
+    force_rms_n: AboveZero
+    force_error_n: Annotated[float, Range(math.ulp(0.0), math.inf, "a number above 0")] = math.inf
+    measurements: Annotated[int, Range(1, 100)] = 20
 
 
 class GateKeeper:

@@ -12,7 +12,15 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import BoolArray, FloatArray
-from tactile_resonance.fields import build, check_above_zero, number, numbers, one_of, require
+from tactile_resonance.fields import (
+    AboveZero,
+    Checked,
+    build,
+    number,
+    numbers,
+    one_of,
+    require,
+)
 
 Pair = tuple[float, float]
 Order = Literal["serpentine", "raster"]
@@ -248,14 +256,13 @@ class _Grid:
 
 
 @dataclass(frozen=True)
-class _Spiral:
+class _Spiral(Checked):
     center_m: Pair
-    radius_m: float
+    radius_m: AboveZero
     spacing_m: Spacing
 
     def positions(self) -> FloatArray:
         """Of an Archimedean one, outwards: neighbours along it and from turn to turn about a spacing apart."""
-        check_above_zero(self, "radius_m")
         spacing_m = self.spacing_m[0]
         _check_count(np.pi * (self.radius_m / spacing_m) ** 2)
         pitch = spacing_m / (2 * np.pi)  # radius per angle

@@ -19,9 +19,10 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.fields import (
+    AboveZero,
+    BelowOne,
+    Checked,
     build,
-    check_above_zero,
-    check_within,
     known_keys,
     read,
     read_dataclass,
@@ -91,7 +92,7 @@ def residual_terms_of(ends_hz: tuple[float, float]) -> int:
 
 
 @dataclass(frozen=True)
-class SensorUse:
+class SensorUse(Checked):
     """The sensor and how it is used.
 
     Attributes
@@ -119,22 +120,23 @@ class SensorUse:
     """
 
     name: str = "bimorph"
-    band_low_hz: float = 200.0
+    band_low_hz: AboveZero = 200.0
     band_high_hz: float = 300.0
     order: int = 2
     residual_terms: int | None = None
     further_bands: tuple[PoleBand, ...] = ()
-    sample_rate_hz: float = 50_000.0
+    sample_rate_hz: AboveZero = 50_000.0
     samples_per_period: Annotated[int | None, _read_period] = 20_000
-    level_v: float = 1.0
+    level_v: AboveZero = 1.0
     heading_rad: float = 0.0
     calibrated: bool = False
 
     def __post_init__(self) -> None:
         known = sorted(path.stem for path in share_path("config/sensors").glob("*.yaml"))
         require(self.name in known, "name", self.name, f"one of config/sensors: {', '.join(known)}")
-        check_above_zero(self, "band_low_hz", "level_v", "sample_rate_hz")
-        check_within(self, samples_per_period=(4, 10**8))
+        super().__post_init__()
+        samples = self.samples_per_period
+        require(samples is None or 4 <= samples <= 10**8, "samples_per_period", samples, "4 to 1e+08")
         low, high = self.band_low_hz, self.band_high_hz
         require(high > low, "band_high_hz", high, f"above band_low_hz = {low:g}")
         needed = self.bands[0].residual_terms
@@ -164,28 +166,22 @@ class SensorUse:
 
 
 @dataclass(frozen=True)
-class TimeLimits:
+class TimeLimits(Checked):
     """Longest durations [s]; a point that takes longer fails, a scan that does ends."""
 
-    point_s: float = 60.0
-    scan_s: float = 3600.0
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "point_s", "scan_s")
+    point_s: AboveZero = 60.0
+    scan_s: AboveZero = 3600.0
 
 
 @dataclass(frozen=True)
-class DriftLimits:
+class DriftLimits(Checked):
     """How far the poles in air may move during a scan; what is less is no warning, however significant.
 
     Both are this project's choice: a fiftieth of what distinguishes 10 from 12 % gelatine (arXiv 1805.00682).
     """
 
-    f0_hz: float = 0.05
-    damping_ratio: float = 5e-5
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "f0_hz", "damping_ratio")
+    f0_hz: AboveZero = 0.05
+    damping_ratio: AboveZero = 5e-5
 
 
 @dataclass(frozen=True)
@@ -221,7 +217,7 @@ class Notes:
 
 
 @dataclass(frozen=True, eq=False)
-class ScanScene:
+class ScanScene(Checked):
     """What a scan is to do.
 
     Attributes
@@ -264,7 +260,7 @@ class ScanScene:
     """
 
     name: str
-    force_n: float
+    force_n: AboveZero
     positions_m: FloatArray
     frame_id: str = "table"
     hold: HoldMode = HoldMode.FORCE
@@ -275,7 +271,7 @@ class ScanScene:
     blocks: BlockLimits | None = None
     gate: Gate | None = None
     tissue_classes: tuple[TissueClass, ...] = ()
-    unknown_level: float = 0.01
+    unknown_level: BelowOne = 0.01
     nominal_contact: NominalContact | None = None
     on_failure: OnFailure = OnFailure.CONTINUE
     time_limits: TimeLimits = field(default_factory=TimeLimits)
@@ -286,9 +282,7 @@ class ScanScene:
     protocols: tuple[ProtocolRequest, ...] = ()
 
     def __post_init__(self) -> None:
-        check_above_zero(self, "force_n")
-        level = self.unknown_level
-        require(0 < level < 1, "unknown_level", level, "a number above 0, below 1")
+        super().__post_init__()
         accepted = f"at most {MOST_FORCE_N:g}; contact control accepts less, by its limits"
         require(self.force_n <= MOST_FORCE_N, "force_n", self.force_n, accepted)
         require(bool(self.frame_id), "frame_id", self.frame_id, "the name of a frame")

@@ -20,10 +20,11 @@ from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.array_files import read_arrays
 from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import (
+    AboveZero,
+    Checked,
     FileName,
+    Range,
     build,
-    check_above_zero,
-    check_within,
     cut,
     one_of,
     read,
@@ -273,7 +274,7 @@ def _barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class TouchRequest:
+class TouchRequest(Checked):
     """A surface that is to be found by touching it.
 
     Attributes
@@ -296,20 +297,19 @@ class TouchRequest:
     points_m: tuple[tuple[float, float], ...]
     form: Literal["plane", "quadric"] = "plane"
     expected_height_m: float = 0.0
-    force_n: float | None = None
+    force_n: AboveZero | None = None
     tolerance_m: float = 2e-4
-    search_m: float = 0.0
+    search_m: Annotated[float, Range(0.0, MOST_SEARCH_M)] = 0.0
 
     def __post_init__(self) -> None:
         least, given = 3 if self.form == "plane" else 6, len(self.points_m)
         require(given >= least, "points_m", given, f"{least} positions or more for a {self.form}")
-        check_above_zero(self, "force_n")
+        super().__post_init__()
         require(self.tolerance_m > 0, "tolerance_m", self.tolerance_m, "a number above 0")
-        check_within(self, search_m=(0.0, MOST_SEARCH_M))
 
 
 @dataclass(frozen=True)
-class NormalRequest:
+class NormalRequest(Checked):
     """How normals are found by touch.
 
     Attributes
@@ -329,23 +329,12 @@ class NormalRequest:
         By which a touch may lie off the plane through all, where there are more than three [m].
     """
 
-    radius_m: float = 2e-3
-    touches: int = 3
-    force_n: float = 0.0
-    most_angle_rad: float = 0.35
-    most_std_rad: float = 0.03
-    tolerance_m: float = 2e-4
-
-    def __post_init__(self) -> None:
-        check_within(
-            self,
-            radius_m=(5e-4, 0.01),
-            touches=(3, 12),
-            force_n=(0.0, 1.0),
-            most_angle_rad=(0.0, 0.8),
-            most_std_rad=(1e-3, 0.1),
-            tolerance_m=(1e-5, 2e-3),
-        )
+    radius_m: Annotated[float, Range(5e-4, 0.01)] = 2e-3
+    touches: Annotated[int, Range(3, 12)] = 3
+    force_n: Annotated[float, Range(0.0, 1.0)] = 0.0
+    most_angle_rad: Annotated[float, Range(0.0, 0.8)] = 0.35
+    most_std_rad: Annotated[float, Range(1e-3, 0.1)] = 0.03
+    tolerance_m: Annotated[float, Range(1e-5, 2e-3)] = 2e-4
 
 
 def read_surface(fields: Mapping[str, Any], folder: Path, where: str) -> Surface | TouchRequest:

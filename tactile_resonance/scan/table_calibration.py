@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,9 +21,10 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Six
 from tactile_resonance.fields import (
+    AboveZero,
+    Checked,
+    Range,
     build,
-    check_above_zero,
-    check_within,
     number,
     read_dataclass,
     read_yaml,
@@ -54,23 +55,21 @@ _HEADER = """\
 
 
 @dataclass(frozen=True)
-class CalibrationRequest:
+class CalibrationRequest(Checked):
     """What is touched and what is accepted; ``action/CalibrateTable.action`` gives unit and meaning."""
 
     points_m: tuple[tuple[float, float, float], ...]
-    force_n: float = 0.01
-    search_m: float = 0.0
-    flatness_m: float = 0.0
-    most_tilt_rad: float = 0.05
+    force_n: AboveZero = 0.01
+    search_m: Annotated[float, Range(0.0, MOST_SEARCH_M)] = 0.0
+    flatness_m: Annotated[float, Range(0.0, 1e-3)] = 0.0
+    most_tilt_rad: Annotated[float, Range(1e-6, 0.2)] = 0.05
     heading_rad: float = 0.0
     sensor: str = SensorUse.name
     file: str = ""
 
     def __post_init__(self) -> None:
         build(SensorUse, "sensor:", self.sensor)
-        check_above_zero(self, "force_n")
-        ranges = {"search_m": (0.0, MOST_SEARCH_M), "flatness_m": (0.0, 1e-3)}
-        check_within(self, **ranges, most_tilt_rad=(1e-6, 0.2))
+        super().__post_init__()
         number(self.heading_rad, "heading_rad")
         require(len(self.points_m) >= 3, "points", len(self.points_m), "three points or more")
         for index, point in enumerate(self.points_m):

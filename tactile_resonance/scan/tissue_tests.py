@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tactile_resonance.fields import check_above_zero, known, require
+from tactile_resonance.fields import AboveZero, Checked, known, require
 from tactile_resonance.files import csv_text, write_whole
 from tactile_resonance.mechanics.indentation import IndentationRecord, Protocol
 from tactile_resonance.recording.messages import indentation_from_message
@@ -37,7 +37,7 @@ _OF_COURSE = ("ramp_s", "hold_s", "peak_force_n", "relaxed_share")  # fields of 
 
 
 @dataclass(frozen=True)
-class ProtocolRequest:
+class ProtocolRequest(Checked):
     """One test that a scene asks for, after the poles of a point are measured and in a contact of its own.
 
     Attributes
@@ -57,16 +57,16 @@ class ProtocolRequest:
 
     kind: Protocol
     hold_s: float = 0.0
-    force_n: float | None = None
-    press_speed_m_s: float | None = None
-    unload_speed_m_s: float | None = None
+    force_n: AboveZero | None = None
+    press_speed_m_s: AboveZero | None = None
+    unload_speed_m_s: AboveZero | None = None
     points: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         drawn = self.kind is Protocol.INDENTATION
         good = 0 < self.hold_s <= 3600 or (drawn and self.hold_s == 0)
         require(good, "hold_s", self.hold_s, "above 0, at most 3600 (0 only for an indentation)")
-        check_above_zero(self, "force_n", "press_speed_m_s", "unload_speed_m_s")
+        super().__post_init__()
         alone = self.unload_speed_m_s is None or drawn
         require(alone, "unload_speed_m_s", self.unload_speed_m_s, f"none with {self.kind.value}")
         if drawn and self.unload_speed_m_s is None:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.fields import check_above_zero, check_not_negative, require
+from tactile_resonance.fields import AboveZero, Checked, NotNegative, require
 
 NAN = float("nan")
 _BEND = 1 / 3  # see `refer_to_nominal`
@@ -61,7 +61,7 @@ class ContactLoad:
 
 
 @dataclass(frozen=True, eq=False)
-class NominalContact:
+class NominalContact(Checked):
     """Force and age of contact to which tissue classes refer, and how poles change beside them.
 
     Attributes
@@ -84,19 +84,18 @@ class NominalContact:
         unknown.
     """
 
-    force_n: float
-    age_s: float
+    force_n: AboveZero
+    age_s: AboveZero
     sensitivity: ForceSensitivity
     creep: float = 0.0
-    creep_std: float = 0.0
-    force_scale_std: float = 0.0
+    creep_std: NotNegative = 0.0
+    force_scale_std: NotNegative = 0.0
     unknown_force_std_n: float = NAN
     unknown_age_factor: float = NAN
 
     def __post_init__(self) -> None:
-        check_above_zero(self, "force_n", "age_s")
+        super().__post_init__()
         require(0 <= self.creep < 1, "creep", self.creep, "0 or above, below 1")
-        check_not_negative(self, "creep_std", "force_scale_std")
         value = self.unknown_force_std_n
         require(not value <= 0, "unknown_force_std_n", value, "a number above 0")
         value = self.unknown_age_factor

@@ -7,16 +7,18 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import (
+    AboveZero,
+    BelowOne,
+    Checked,
+    NotNegative,
+    Range,
     build,
-    check_above_zero,
-    check_not_negative,
-    check_within,
     cut,
     join,
     known_keys,
@@ -41,23 +43,18 @@ from tactile_resonance.tissue.spread import (
     TissueSpread,
 )
 
+Correlation = Annotated[float, Range(-1, 1)]
+
 
 @dataclass(frozen=True, kw_only=True)
-class _Point:
+class _Point(Checked):
     """Part of a file: f0 and damping ratio, and their spread."""
 
-    f0_hz: float
-    damping_ratio: float
-    f0_std_hz: float
-    damping_ratio_std: float
-    correlation: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "f0_hz")
-        damping = self.damping_ratio
-        require(0 < damping < 1, "damping_ratio", damping, "a number above 0, below 1")
-        check_not_negative(self, "f0_std_hz", "damping_ratio_std")
-        check_within(self, correlation=(-1, 1))
+    f0_hz: AboveZero
+    damping_ratio: BelowOne
+    f0_std_hz: NotNegative
+    damping_ratio_std: NotNegative
+    correlation: Correlation = 0.0
 
     @property
     def estimate(self) -> FloatArray:
@@ -94,21 +91,14 @@ class _Samples:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Source:
+class _Source(Checked):
     """Part of a file: the spread of a class from one source."""
 
-    f0_std_hz: float
-    damping_ratio_std: float
-    correlation: float = 0.0
-    degrees_of_freedom: int
+    f0_std_hz: NotNegative
+    damping_ratio_std: NotNegative
+    correlation: Correlation = 0.0
+    degrees_of_freedom: Annotated[int, Range(1, math.inf, "above 0")]
     holds: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        check_not_negative(self, "f0_std_hz", "damping_ratio_std")
-        check_within(self, correlation=(-1, 1))
-        require(
-            self.degrees_of_freedom > 0, "degrees_of_freedom", self.degrees_of_freedom, "above 0"
-        )
 
     def named(self, name: str) -> SpreadSource:
         std = self.f0_std_hz, self.damping_ratio_std
@@ -120,28 +110,19 @@ class _Source:
 class _Preload(_Point):
     """Part of a file: a point that was measured under a force."""
 
-    force_n: float
-    force_std_n: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_above_zero(self, "force_n")
-        check_not_negative(self, "force_std_n")
+    force_n: AboveZero
+    force_std_n: NotNegative
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Sensitivity:
+class _Sensitivity(Checked):
     """Part of a file: how poles change with the force."""
 
     f0_hz_per_n: float
     damping_ratio_per_n: float
-    f0_std_hz_per_n: float
-    damping_ratio_std_per_n: float
-    correlation: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_not_negative(self, "f0_std_hz_per_n", "damping_ratio_std_per_n")
-        check_within(self, correlation=(-1, 1))
+    f0_std_hz_per_n: NotNegative
+    damping_ratio_std_per_n: NotNegative
+    correlation: Correlation = 0.0
 
     def sensitivity(self) -> ForceSensitivity:
         stds = self.f0_std_hz_per_n, self.damping_ratio_std_per_n

@@ -22,7 +22,7 @@ from numba import boolean, float64, from_dtype, int64, njit
 from numba.types import UniTuple
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.fields import check_above_zero, check_not_negative, read_file, require
+from tactile_resonance.fields import AboveZero, Checked, NotNegative, read_file, require
 from tactile_resonance.simulation.noise import NormalRows, Seed
 from tactile_resonance.simulation.ur5e.poses import Six
 
@@ -37,7 +37,7 @@ NO_NUMBER = -32768
 
 
 @dataclass(frozen=True)
-class CellParameters:
+class CellParameters(Checked):
     """A cell's scale and errors; see ``config/load_cells``.
 
     Attributes
@@ -56,21 +56,15 @@ class CellParameters:
     """
 
     name: str
-    force_divisor: float
-    torque_divisor: float
-    force_noise_rms_n: float
-    torque_noise_rms_nm: float
-    force_range_n: float
-    torque_range_nm: float
+    force_divisor: AboveZero
+    torque_divisor: AboveZero
+    force_noise_rms_n: NotNegative
+    torque_noise_rms_nm: NotNegative
+    force_range_n: AboveZero
+    torque_range_nm: AboveZero
     force_bias_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
     torque_bias_nm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     force_drift_n_per_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_above_zero(
-            self, "force_divisor", "torque_divisor", "force_range_n", "torque_range_nm"
-        )
-        check_not_negative(self, "force_noise_rms_n", "torque_noise_rms_nm")
 
     @classmethod
     def from_yaml(cls, path: Path | None = None) -> CellParameters:

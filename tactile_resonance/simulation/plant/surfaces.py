@@ -6,13 +6,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Vector, difference, dot, vector
-from tactile_resonance.fields import check_not_negative, check_within, require
+from tactile_resonance.fields import Checked, Range, Seed, require
 
 if TYPE_CHECKING:
     from tactile_resonance.contact.samples import Pose
@@ -121,7 +121,7 @@ def relative_radius_m(tip_radius_m: float, surface: PlantSurface) -> float:
 
 
 @dataclass(frozen=True)
-class SurfaceMotion:
+class SurfaceMotion(Checked):
     """Displacement of a surface along its outward normal, as a function of time.
 
     Breath is ``b cos^{2n}(pi f t + phase)`` (Lujan, Larsen, Balter & Ten Haken, Med. Phys. 26 (1999) 715):
@@ -142,17 +142,12 @@ class SurfaceMotion:
         Of both phases at time 0, uniform.
     """
 
-    breath_m: float = 0.0
-    breath_hz: float = 0.25
-    breath_power: int = 3
-    heart_m: float = 0.0
-    heart_hz: float = 1.2
-    phase_seed: int = 1
-
-    def __post_init__(self) -> None:
-        check_within(self, breath_m=(0, 0.02), heart_m=(0, 0.005))  # peak to peak
-        check_within(self, breath_hz=(0.05, 2.0), heart_hz=(0.3, 10.0), breath_power=(1, 3))
-        check_not_negative(self, "phase_seed")
+    breath_m: Annotated[float, Range(0, 0.02)] = 0.0
+    breath_hz: Annotated[float, Range(0.05, 2.0)] = 0.25
+    breath_power: Annotated[int, Range(1, 3)] = 3
+    heart_m: Annotated[float, Range(0, 0.005)] = 0.0
+    heart_hz: Annotated[float, Range(0.3, 10.0)] = 1.2
+    phase_seed: Seed = 1
 
     @cached_property
     def phases_rad(self) -> tuple[float, float]:

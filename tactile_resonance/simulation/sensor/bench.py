@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.fields import check_not_negative, require
+from tactile_resonance.fields import Checked, NotNegative, require
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.record import Channel, Origin, Record
 from tactile_resonance.sensor import SensorParameters, read_sensor
@@ -43,7 +43,7 @@ _SENSOR, _ACTUATOR, _HUM = range(3)  # independent random streams of a run
 
 
 @dataclass(frozen=True)
-class BenchEffects:
+class BenchEffects(Checked):
     """What spoils the signals, each with a switch (or a size, 0 = off) of its own.
 
     Attributes
@@ -67,15 +67,15 @@ class BenchEffects:
     noise: bool = True
     quantisation: bool = True
     nonlinearity: bool = False
-    actuator_noise_v: float = 0.0
+    actuator_noise_v: NotNegative = 0.0
     channel_skew_s: float = 0.0
-    hum_v: float = 0.0
-    hum_frequency_hz: float = 50.0
+    hum_v: NotNegative = 0.0
+    hum_frequency_hz: NotNegative = 50.0
     offset_v: float = 0.0
     drift_v_per_s: float = 0.0
 
     def __post_init__(self) -> None:
-        check_not_negative(self, "actuator_noise_v", "hum_v", "hum_frequency_hz")
+        super().__post_init__()
         for name in ("channel_skew_s", "offset_v", "drift_v_per_s"):
             value = getattr(self, name)
             require(bool(np.isfinite(value)), name, value, "a finite number")

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance._typing import ComplexArray, FloatArray
-from tactile_resonance.fields import check_above_zero, check_within, require
+from tactile_resonance.fields import AboveZero, Checked, Range, require
 from tactile_resonance.mechanics.prony import Prony
 
 
@@ -65,18 +66,14 @@ class Tissue:
 
 
 @dataclass(frozen=True)
-class HertzParameters:
+class HertzParameters(Checked):
     """How the tip touches: preload [N] and what all tissues have in common."""
 
-    force_n: float
-    poisson_ratio: float
-    density_kg_per_m3: float
+    force_n: AboveZero
+    poisson_ratio: Annotated[float, Range(0, 0.5)]
+    density_kg_per_m3: AboveZero
     radiation: bool
-    radiation_reference_hz: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "force_n", "density_kg_per_m3", "radiation_reference_hz")
-        check_within(self, poisson_ratio=(0, 0.5))
+    radiation_reference_hz: AboveZero
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,14 +19,7 @@ from numpy.typing import ArrayLike
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.fields import (
-    build,
-    check_above_zero,
-    check_not_negative,
-    check_within,
-    read_file,
-    require,
-)
+from tactile_resonance.fields import AboveZero, Checked, Range, Seed, build, read_file, require
 from tactile_resonance.simulation.tissue.hertz import HertzParameters, Tissue
 
 GELATINE_PERCENT_RANGE = (8.0, 20.0)  # how far the power law is trusted beyond the tabulated values
@@ -148,7 +142,7 @@ def uniform(tissue: Tissue) -> Material:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeterogeneityEntry:
+class HeterogeneityEntry(Checked):
     """Part of a file: a Gaussian random field, and how far the modulus follows it.
 
     Of unit variance, correlation ``exp(-r^2 / (2 l^2))``: a sum of plane waves with Gaussian wave vectors
@@ -164,14 +158,9 @@ class HeterogeneityEntry:
         Standard deviation of ln E.
     """
 
-    correlation_length_m: float
-    seed: int = 0
-    modulus_spread: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "correlation_length_m")
-        check_not_negative(self, "seed")
-        check_within(self, modulus_spread=(0, 1))
+    correlation_length_m: AboveZero
+    seed: Seed = 0
+    modulus_spread: Annotated[float, Range(0, 1)]
 
     @cached_property
     def _waves(self) -> tuple[FloatArray, FloatArray]:

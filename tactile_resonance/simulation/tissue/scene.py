@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.vectors import Vector
-from tactile_resonance.fields import build, check_above_zero, read_dataclass, read_yaml, require
+from tactile_resonance.fields import AboveZero, Checked, build, read_dataclass, read_yaml, require
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -38,14 +38,11 @@ Point = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Disc:
+class Disc(Checked):
     """A disc in x, y at any height: the surface of a round dish."""
 
     center_m: tuple[float, float]
-    radius_m: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "radius_m")
+    radius_m: AboveZero
 
     def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie inside or on the edge."""
@@ -92,14 +89,11 @@ class HalfSpace:
 
 
 @dataclass(frozen=True)
-class Sphere:
+class Sphere(Checked):
     """A ball; positions without a height are taken at height 0."""
 
     center_m: Vector
-    radius_m: float
-
-    def __post_init__(self) -> None:
-        check_above_zero(self, "radius_m")
+    radius_m: AboveZero
 
     def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie inside or on the surface."""
@@ -398,15 +392,15 @@ class _BuriedEntry(TissueEntry, ShapeEntry):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _BenchPart:
+class _BenchPart(Checked):
     """What a scene file has for the bench."""
 
     name: str | None = None
-    force_n: float
+    force_n: AboveZero
     regions: tuple[_RegionEntry, ...]
     buried: tuple[_BuriedEntry, ...] = ()
     motion: SurfaceMotion | None = None
 
     def __post_init__(self) -> None:
-        check_above_zero(self, "force_n")
+        super().__post_init__()
         require(bool(self.regions), "regions", [], "a list of one region or more")

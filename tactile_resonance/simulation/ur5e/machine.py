@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from tactile_resonance.contact.vectors import Vector, dot, rotated_back
-from tactile_resonance.fields import check_above_zero, check_not_negative
+from tactile_resonance.fields import AboveZero, Checked, NotNegative
 from tactile_resonance.simulation.noise import Jitter, Seed
 from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
@@ -49,7 +49,7 @@ from tactile_resonance.simulation.ur5e.target import (
 
 
 @dataclass(frozen=True)
-class TrackingParameters:
+class TrackingParameters(Checked):
     """How an arm follows; the defaults are chosen to resemble a UR e-series, not measured on one.
 
     Attributes
@@ -64,14 +64,10 @@ class TrackingParameters:
         Its spectrum falls as of white noise through two poles at this rate [rad/s].
     """
 
-    dead_time_s: float = 0.004
-    lag_s: float = 0.010
-    jitter_rms_m: float = 3e-6
-    jitter_corner_rad_s: float = 50.0
-
-    def __post_init__(self) -> None:
-        check_not_negative(self, "dead_time_s", "lag_s", "jitter_rms_m")
-        check_above_zero(self, "jitter_corner_rad_s")
+    dead_time_s: NotNegative = 0.004
+    lag_s: NotNegative = 0.010
+    jitter_rms_m: NotNegative = 3e-6
+    jitter_corner_rad_s: AboveZero = 50.0
 
 
 class Lag:
