@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.vectors import Vector, difference, dot, vector
+from tactile_resonance.contact.vectors import Vector, added, dot, scaled, vector
 from tactile_resonance.fields import Checked, Range, Seed, require
 
 if TYPE_CHECKING:
@@ -21,88 +21,55 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FlatSurface:
-    """A flat surface through a point; `normal` points out of the tissue and has length 1."""
+class Surface:
+    """A plane, a sphere of tissue, touched from outside, or a hollow in tissue, touched from inside.
+
+    Heights above a sphere are radial, so that a ball of radius r is pressed in by r less the height of its
+    centre, exactly, wherever it is.
+
+    Attributes
+    ----------
+    point_m, normal : (3,) arrays
+        A place of it, and the direction out of the tissue there, of length 1.
+    curvature_per_m : float
+        Along any direction; 0 of a plane, below 0 of a hollow.
+    """
 
     point_m: FloatArray
     normal: FloatArray
+    curvature_per_m: float = 0.0
 
     @classmethod
-    def tilted(
-        cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0
-    ) -> FlatSurface:
+    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> Surface:
         """Return the plane through (0, 0, height), its normal tilted from +z towards an azimuth."""
         sine = math.sin(tilt_rad)
         normal = [sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad), math.cos(tilt_rad)]
         return cls(np.array([0.0, 0.0, height_m]), np.array(normal))
-
-    @property
-    def curvature_per_m(self) -> float:
-        """None [1/m]."""
-        return 0.0
 
     @cached_property
     def _floats(self) -> tuple[Vector, Vector]:
         return vector(self.point_m), vector(self.normal)
 
     def height_of(self, position_m: Vector) -> tuple[float, Vector]:
-        """Height of a position above the plane [m], and the normal."""
-        (x, y, z), normal = self._floats
-        return dot(normal, (position_m[0] - x, position_m[1] - y, position_m[2] - z)), normal
-
-
-@dataclass(frozen=True)
-class RoundSurface:
-    """A sphere of tissue, touched from outside, or a hollow in tissue, touched from inside.
-
-    Heights are radial, so that a ball of radius r is pressed in by r less the height of its centre, exactly,
-    wherever it is.
-
-    Attributes
-    ----------
-    centre_m : (3,) array
-    radius_m : float
-    hollow : bool
-        Whether the tissue is outside of it.
-    """
-
-    centre_m: FloatArray
-    radius_m: float
-    hollow: bool = False
-
-    def __post_init__(self) -> None:
-        require(0 < self.radius_m < math.inf, "radius_m", self.radius_m, "a number above 0")
-
-    @property
-    def curvature_per_m(self) -> float:
-        """Along any direction [1/m]; below 0 of a hollow."""
-        return -1 / self.radius_m if self.hollow else 1 / self.radius_m
-
-    @cached_property
-    def _centre(self) -> Vector:
-        return vector(self.centre_m)
-
-    def height_of(self, position_m: Vector) -> tuple[float, Vector]:
-        """Height of a position above the surface [m], and the normal there: from the centre, or towards it.
+        """Height of a position above it [m], and the normal there.
 
         Raises
         ------
         ValueError
-            In the centre, which has no normal.
+            In the centre of a sphere, which has no normal.
         """
-        x, y, z = difference(position_m, self._centre)
-        away = math.hypot(x, y, z)
+        (x, y, z), normal = self._floats
+        way = (position_m[0] - x, position_m[1] - y, position_m[2] - z)
+        if self.curvature_per_m == 0.0:
+            return dot(normal, way), normal
+        # from the centre, or towards that of a hollow, in radii
+        out = added(scaled(self.curvature_per_m, way), normal)
+        away = math.hypot(*out)
         require(away > 0, "position_m", position_m, "a place beside the sphere's centre")
-        sign = -1.0 if self.hollow else 1.0
-        normal = sign * x / away, sign * y / away, sign * z / away
-        return sign * (away - self.radius_m), normal
+        return (away - 1) / self.curvature_per_m, scaled(1 / away, out)
 
 
-PlantSurface = FlatSurface | RoundSurface
-"""The undisturbed surface of what lies on the table."""
-
-
-def relative_radius_m(tip_radius_m: float, surface: PlantSurface) -> float:
+def relative_radius_m(tip_radius_m: float, surface: Surface) -> float:
     """Radius R of the ball that a flat surface would have to meet to be pressed alike [m].
 
     ``1 / R = 1 / r + k`` for a ball of radius r on a surface of curvature k (Hertz 1882; Johnson, *Contact
@@ -178,9 +145,9 @@ class LaidScene:
     scene: PhantomScene
     table: Pose
 
-    def surface(self) -> FlatSurface:
+    def surface(self) -> Surface:
         """The undisturbed surface in the base."""
-        return FlatSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
+        return Surface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
 
     def tissue_at(self, position_m: FloatArray) -> Tissue | None:
         """What the tip touches under a place (3,) in the base."""
