@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every acquisition device promises, and what its blocks hold."""
+"""What every acquisition device promises."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind
+from tactile_resonance.record import Record
 
 
 class DeviceError(RuntimeError):
@@ -17,55 +17,20 @@ class DeviceError(RuntimeError):
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """What a reader of the samples must know of the device.
+    """What who plays with it must know of the device.
 
     Attributes
     ----------
     name : str
-    simulated : bool
-    input_kind : InputKind
-        Whether the actuator channel is measured at the sensor's terminals.
-    between_samples : BetweenSamples
     output_peak_v : float
         Largest voltage it can put out.
-    channel_delay_s : float
-        Of the sensor channel behind the actuator channel; NaN where unknown.
-    anti_alias_filter : str
-        For people; empty where unknown.
-    frame_id : str
-        Sensor tip frame, where a replay knows it; empty: that of whoever owns the device.
+    recorded : bool
+        Its blocks are those of a recording, with their contact and frame.
     """
 
     name: str
-    simulated: bool
-    input_kind: InputKind
-    between_samples: BetweenSamples
     output_peak_v: float
-    channel_delay_s: float = float("nan")
-    anti_alias_filter: str = ""
-    frame_id: str = ""
-
-
-@dataclass(frozen=True)
-class AcquiredBlock:
-    """One period of both channels.
-
-    Attributes
-    ----------
-    index : int
-        From 0 since the excitation started, without gaps.
-    time_ns : int
-        First sample (UNIX time) [ns].
-    actuator, sensor : Channel
-    contact : Contact or None
-        That of a recording; None where the block was taken just now.
-    """
-
-    index: int
-    time_ns: int
-    actuator: Channel
-    sensor: Channel
-    contact: Contact | None = None
+    recorded: bool = False
 
 
 class AcquisitionDevice(Protocol):
@@ -93,8 +58,8 @@ class AcquisitionDevice(Protocol):
         """Load the output, make the inputs ready, and start both together, from rest."""
         ...
 
-    def read_block(self, timeout_s: float) -> AcquiredBlock:
-        """The next period. No block is skipped: a device that lost one raises."""
+    def read_block(self, timeout_s: float) -> Record:
+        """The next period, with what the device knows of it. No block is skipped: one that lost one raises."""
         ...
 
     def interrupt(self) -> None:

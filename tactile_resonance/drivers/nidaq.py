@@ -22,12 +22,7 @@ from numpy.polynomial import polynomial
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.clock import WallClock
-from tactile_resonance.drivers.acquisition import (
-    AcquiredBlock,
-    AcquisitionDevice,
-    DeviceError,
-    DeviceInfo,
-)
+from tactile_resonance.drivers.acquisition import AcquisitionDevice, DeviceError, DeviceInfo
 from tactile_resonance.fields import (
     AboveZero,
     Checked,
@@ -39,7 +34,7 @@ from tactile_resonance.fields import (
     require,
 )
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.record import BetweenSamples, Channel, InputKind
+from tactile_resonance.record import BetweenSamples, Channel, InputKind, Origin, Record
 
 TERMINALS = {
     "differential": "DIFF",
@@ -265,15 +260,7 @@ class NiDaqDevice(AcquisitionDevice):
                 f"nidaqmx: sample_rate_hz: {sample_rate_hz:.9g}, the device would sample at "
                 f"{real_hz:.9g}: expected a rate that it makes exactly"
             )
-        return DeviceInfo(
-            name=", ".join(names),
-            simulated=False,
-            input_kind=InputKind.MEASURED if config.actuator else InputKind.COMMANDED,
-            between_samples=config.between_samples,
-            output_peak_v=config.output.max_voltage_v,
-            channel_delay_s=config.channel_delay_s,
-            anti_alias_filter=config.anti_alias_filter,
-        )
+        return DeviceInfo(", ".join(names), config.output.max_voltage_v)
 
     def play(self, excitation: Excitation) -> None:
         """Load one period, commit both tasks, start the output, which waits for the inputs, then these."""
@@ -308,7 +295,7 @@ class NiDaqDevice(AcquisitionDevice):
                 self._start_ns = self._clock.now_ns()
             self._playing, self._drive, self._index = excitation, period, 0
 
-    def read_block(self, timeout_s: float) -> AcquiredBlock:
+    def read_block(self, timeout_s: float) -> Record:
         """The next period, whole; on any error the output is set to 0 V first."""
         task, output, excitation = self._input, self._output, self._playing
         if excitation is None or task is None or output is None:
@@ -326,13 +313,17 @@ class NiDaqDevice(AcquisitionDevice):
             if ended:
                 raise DeviceError(f"nidaqmx: block {self._index + 1}: the output has stopped")
         channels = [scale.channel(row) for scale, row in zip(self._scales, raw, strict=True)]
-        if not self._config.actuator:
+        config, begun_ns = self._config, self._start_ns + round(self._index * excitation.period_s * 1e9)
+        if not config.actuator:
             channels.insert(0, Channel(self._drive))
-        block = AcquiredBlock(
-            self._index,
-            self._clock.ros_ns(self._start_ns + round(self._index * excitation.period_s * 1e9)),
-            channels[0],
-            channels[1],
+        block = Record(
+            *(channels[0], channels[1], excitation.sample_rate_hz, n),
+            block_index=self._index,
+            input_kind=InputKind.MEASURED if config.actuator else InputKind.COMMANDED,
+            between_samples=config.between_samples,
+            channel_delay_s=config.channel_delay_s,
+            anti_alias_filter=config.anti_alias_filter,
+            origin=Origin(time_ns=self._clock.ros_ns(begun_ns)),
         )
         self._index += 1
         return block

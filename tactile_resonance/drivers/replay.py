@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_resonance.clock import WallClock
-from tactile_resonance.drivers.acquisition import AcquiredBlock, DeviceError, DeviceInfo
+from tactile_resonance.drivers.acquisition import DeviceError, DeviceInfo
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.multisine import Excitation
@@ -110,7 +110,7 @@ class ReplayDevice:
         ]
 
     def configure(self, sample_rate_hz: float) -> DeviceInfo:
-        """What the recording says of its device."""
+        """Check the rate."""
         if self._measurement is None:
             raise DeviceError("replay: nothing planned to play")
         record = self._measurement.records[0]
@@ -119,16 +119,7 @@ class ReplayDevice:
                 f"replay: sample_rate_hz: {sample_rate_hz:g}, recorded was "
                 f"{record.sample_rate_hz:g}"
             )
-        return DeviceInfo(
-            name=f"replay of {self._path.name}",
-            simulated=record.origin.simulated,
-            input_kind=record.input_kind,
-            between_samples=record.between_samples,
-            output_peak_v=float("inf"),
-            channel_delay_s=record.channel_delay_s,
-            anti_alias_filter=record.anti_alias_filter,
-            frame_id=record.origin.frame_id if self._file is None else "",
-        )
+        return DeviceInfo(f"replay of {self._path.name}", float("inf"), recorded=True)
 
     def play(self, excitation: Excitation) -> None:
         """Start the clock for one realisation. Only now is the measurement used up."""
@@ -150,7 +141,7 @@ class ReplayDevice:
         """End the wait for a block."""
         self._stopped.set()
 
-    def read_block(self, timeout_s: float) -> AcquiredBlock:
+    def read_block(self, timeout_s: float) -> Record:
         """The next block, when its last sample would have been taken; a gap is an error."""
         excitation = self._playing
         if excitation is None:
@@ -175,13 +166,8 @@ class ReplayDevice:
             )
         self._index += 1
         begun_ns = self._start_ns + round(index * excitation.period_s * 1e9)
-        return AcquiredBlock(
-            index,
-            record.origin.time_ns or self._clock.ros_ns(begun_ns),
-            record.actuator,
-            record.sensor,
-            record.origin.contact,
-        )
+        time_ns = record.origin.time_ns or self._clock.ros_ns(begun_ns)
+        return replace(record, origin=replace(record.origin, time_ns=time_ns))
 
     def stop(self) -> None:
         """End what plays."""
@@ -261,7 +247,7 @@ def _measurement_of_file(recording: Recording, label: str) -> StoredMeasurement:
                 samples_per_period=n,
                 realisation=realisation,
                 block_index=period,
-                origin=Origin(label=label),
+                origin=Origin(frame_id="", label=label),
             )
             for period in range(periods)
         ]

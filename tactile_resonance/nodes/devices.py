@@ -18,12 +18,7 @@ from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.clock import ClockLostError, SimulatedClock
-from tactile_resonance.drivers.acquisition import (
-    AcquiredBlock,
-    AcquisitionDevice,
-    DeviceError,
-    DeviceInfo,
-)
+from tactile_resonance.drivers.acquisition import AcquisitionDevice, DeviceError, DeviceInfo
 from tactile_resonance.drivers.nidaq import NiDaqConfig, NiDaqDevice
 from tactile_resonance.fields import read_file
 from tactile_resonance.multisine import Excitation
@@ -32,7 +27,7 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import excitation_to_message, time_message
 from tactile_resonance.nodes.parameters import Fixed, values
 from tactile_resonance.nodes.running import RESULTS, STREAM
-from tactile_resonance.record import BetweenSamples, Contact, InputKind
+from tactile_resonance.record import Contact, Record
 from tactile_resonance.recording.messages import (
     contact_from_message,
     record_from_message,
@@ -198,15 +193,7 @@ class BenchDevice(AcquisitionDevice):
             raise DeviceError(
                 f"device: no bench answers on {self._play_client.srv_name}, start fake_hardware_node"
             )
-        return DeviceInfo(
-            name="simulated bench",
-            simulated=True,
-            input_kind=InputKind.MEASURED,
-            between_samples=BetweenSamples.BAND_LIMITED,
-            output_peak_v=float("inf"),
-            channel_delay_s=0.0,
-            anti_alias_filter="ideal",
-        )
+        return DeviceInfo("simulated bench", float("inf"))
 
     def play(self, excitation: Excitation) -> None:
         """Ask the bench to play."""
@@ -233,7 +220,7 @@ class BenchDevice(AcquisitionDevice):
         if (clock := self._clock) is not None:
             clock.interrupt()
 
-    def read_block(self, timeout_s: float) -> AcquiredBlock:
+    def read_block(self, timeout_s: float) -> Record:
         """Next block of what is played; blocks of what was stopped before are passed over."""
         if self._playing is not None and self._clock is not None:
             # time goes on to the end of the next block, and stands there until the one after
@@ -259,10 +246,7 @@ class BenchDevice(AcquisitionDevice):
         if message.block_index != self._next_index:
             raise DeviceError(f"device: block {self._next_index + 1} lost, got {message.block_index + 1}")
         self._next_index += 1
-        record = record_from_message(message)
-        return AcquiredBlock(
-            record.block_index, record.origin.time_ns, record.actuator, record.sensor
-        )
+        return record_from_message(message)
 
     def stop(self) -> None:
         """Silence the bench, where there is one."""

@@ -16,12 +16,7 @@ from rclpy.node import Node
 
 from tactile_resonance import msg
 from tactile_resonance.action import Measure
-from tactile_resonance.drivers.acquisition import (
-    AcquiredBlock,
-    AcquisitionDevice,
-    DeviceError,
-    DeviceInfo,
-)
+from tactile_resonance.drivers.acquisition import AcquisitionDevice, DeviceError, DeviceInfo
 from tactile_resonance.fields import counted
 from tactile_resonance.multisine import Excitation, Grid, compress_crest_factor, design_multisine
 from tactile_resonance.nodes import devices
@@ -285,7 +280,7 @@ class ExcitationNode(ManagedNode):
         finally:
             device.stop()
 
-    def _read_block(self, device: AcquisitionDevice, timeout_s: float) -> AcquiredBlock:
+    def _read_block(self, device: AcquisitionDevice, timeout_s: float) -> Record:
         # in simulated time a block takes as long as it takes
         if not self.time_server:
             self._read_by_s = time.monotonic() + timeout_s + HUNG_S
@@ -295,32 +290,25 @@ class ExcitationNode(ManagedNode):
             if device is self._device:
                 self._read_by_s = float("inf")
 
-    def _record(self, block: AcquiredBlock, excitation: Excitation, info: DeviceInfo) -> Record:
-        last_period = block.index == excitation.periods - 1
+    def _record(self, block: Record, excitation: Excitation, info: DeviceInfo) -> Record:
+        """A block of the device as one of the measurement."""
+        last_period = block.block_index == excitation.periods - 1
         last_realisation = excitation.realisation == excitation.realisations - 1
-        end_ns = block.time_ns + round(excitation.period_s * 1e9)
-        return Record(
-            actuator=block.actuator,
-            sensor=block.sensor,
-            sample_rate_hz=excitation.sample_rate_hz,
-            samples_per_period=excitation.samples_per_period,
-            realisation=excitation.realisation,
-            block_index=block.index,
-            input_kind=info.input_kind,
-            between_samples=info.between_samples,
-            channel_delay_s=info.channel_delay_s,
-            anti_alias_filter=info.anti_alias_filter,
-            origin=Origin(
-                measurement_id=excitation.measurement_id,
-                excitation_id=excitation.excitation_id,
-                time_ns=block.time_ns,
-                final=last_period and last_realisation,
-                frame_id=info.frame_id or self._frame_id,
-                label=excitation.label,
-                simulated=info.simulated,
-                contact=block.contact or self._contact.over(block.time_ns, end_ns),
-            ),
+        begin_ns, contact, frame_id = block.origin.time_ns, block.origin.contact, block.origin.frame_id
+        if not info.recorded:
+            end_ns = begin_ns + round(excitation.period_s * 1e9)
+            contact, frame_id = self._contact.over(begin_ns, end_ns), ""
+        origin = Origin(
+            measurement_id=excitation.measurement_id,
+            excitation_id=excitation.excitation_id,
+            time_ns=begin_ns,
+            final=last_period and last_realisation,
+            frame_id=frame_id or self._frame_id,
+            label=excitation.label,
+            simulated=block.origin.simulated,
+            contact=contact,
         )
+        return replace(block, realisation=excitation.realisation, origin=origin)
 
 
 def design(node: Node, goal: Measure.Goal, measurements: int) -> list[Excitation]:

@@ -353,7 +353,13 @@ class FakeHardwareNode(ManagedNode):
                 label=excitation.label,
                 simulated=True,
             )
-            record = replace(block, realisation=excitation.realisation, origin=origin)
+            record = replace(
+                block,
+                realisation=excitation.realisation,
+                channel_delay_s=0.0,
+                anti_alias_filter="ideal",
+                origin=origin,
+            )
             self._blocks.publish(record_to_message(record))
 
         return hand_out

@@ -53,8 +53,8 @@ def test_where_the_machines_time_is_set_blocks_keep_to_the_clock_of_the_forces(h
         shifted_ns = ahead_ns + round(set_s * 1e9)
         monkeypatch.setattr(time, "time_ns", lambda by_ns=shifted_ns: time.monotonic_ns() + by_ns)
         block = device.read_block(1.0)
-        block_ns = begun_ns + round(block.index * EXCITATION.period_s * 1e9)
-        assert forces.own_ns(block.time_ns) == pytest.approx(block_ns, abs=60e9)
+        block_ns = begun_ns + round(block.block_index * EXCITATION.period_s * 1e9)
+        assert forces.own_ns(block.origin.time_ns) == pytest.approx(block_ns, abs=60e9)
     device.stop()
 
 
@@ -62,13 +62,16 @@ def test_periods_come_whole_from_rest_and_in_order(hardware):
     device = playing()
     blocks = [device.read_block(1.0) for _ in range(4)]
     device.stop()
-    assert [block.index for block in blocks] == [0, 1, 2, 3]
+    assert [block.block_index for block in blocks] == [0, 1, 2, 3]
     period_ns = round(EXCITATION.period_s * 1e9)
-    assert np.all(np.diff([block.time_ns for block in blocks]) == period_ns)
+    assert np.all(np.diff([block.origin.time_ns for block in blocks]) == period_ns)
     half_count_v = hardware.coefficients[1] / 2
     for block in blocks:
         assert block.actuator.samples.dtype == np.int32
-        assert block.contact is None
+        assert not block.origin.simulated
+        assert block.input_kind is InputKind.MEASURED
+        assert block.between_samples is BetweenSamples.BAND_LIMITED
+        assert np.isnan(block.channel_delay_s)
         for channel, gain in ((block.actuator, 1.0), (block.sensor, 0.5)):
             error = channel.volts() - gain * EXCITATION.period()
             assert np.max(np.abs(error)) <= half_count_v * (1 + 1e-9)
@@ -104,21 +107,19 @@ def test_clock_trigger_and_order_of_calls(hardware):
 def test_device_says_what_it_is(hardware):
     info = NiDaqDevice(CONFIG).configure(RATE_HZ)
     assert "PCIe-6376" in info.name
-    assert not info.simulated
-    assert info.input_kind is InputKind.MEASURED
-    assert info.between_samples is BetweenSamples.BAND_LIMITED
     assert info.output_peak_v == 5.0
-    assert np.isnan(info.channel_delay_s)
+    assert not info.recorded
     assert hardware.open_tasks == []
     assert hardware.pin_v == 0.0
 
 
 def test_a_commanded_drive_is_what_was_asked(hardware):
-    device = playing(replace(CONFIG, actuator=None))
+    device = playing(replace(CONFIG, actuator=None, channel_delay_s=4e-6))
     block = device.read_block(1.0)
     device.stop()
+    assert block.channel_delay_s == 4e-6
     np.testing.assert_array_equal(block.actuator.samples, EXCITATION.period())
-    assert device.configure(RATE_HZ).input_kind is InputKind.COMMANDED
+    assert block.input_kind is InputKind.COMMANDED
 
 
 @pytest.mark.parametrize("ended", ["stop", "close"])
@@ -148,7 +149,7 @@ def test_realisations_follow_each_other(hardware):
         excitation = replace(EXCITATION, amplitude_v=level * EXCITATION.amplitude_v)
         device.play(excitation)
         first = device.read_block(1.0)
-        assert first.index == 0
+        assert first.block_index == 0
         np.testing.assert_allclose(first.actuator.volts(), excitation.period(), atol=2e-4)
         device.stop()
     assert hardware.pin_v == 0.0
@@ -228,9 +229,7 @@ def test_what_the_device_cannot_do_is_refused(hardware):
     hardware.simultaneous = False
     with pytest.raises(DeviceError, match="one channel after the other"):
         device.configure(RATE_HZ)
-    assert NiDaqDevice(replace(CONFIG, channel_delay_s=4e-6)).configure(
-        RATE_HZ
-    ).channel_delay_s == pytest.approx(4e-6)
+    NiDaqDevice(replace(CONFIG, channel_delay_s=4e-6)).configure(RATE_HZ)
     hardware.simultaneous = True
     device.configure(RATE_HZ)
     loud = replace(EXCITATION, amplitude_v=10 * EXCITATION.amplitude_v)

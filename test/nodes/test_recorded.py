@@ -145,7 +145,7 @@ def test_a_replay_plays_the_run_again_bit_by_bit(run):
         for block, record in zip(blocks, records, strict=True):
             assert same(block.actuator, record.actuator)
             assert same(block.sensor, record.sensor)
-            assert same(block.contact, record.origin.contact)
+            assert same(block.origin.contact, record.origin.contact)
     with pytest.raises(DeviceError, match="recording is over: all 3 measurements"):
         device.plan([design_multisine()])
 
