@@ -202,6 +202,7 @@ class ForceRecord:
         self._force_gap_ns = GAP_PERIODS * 1e9 / rate_hz
         self._now_ns, self._zero_std_n = 0, 0.0
         self._lock = threading.Lock()
+        self._came = threading.Condition(self._lock)
 
     def restart(self, zero_std_n: float = 0.0) -> None:
         """Forget all forces, as of a new tare: earlier ones are not less its zero.
@@ -251,6 +252,12 @@ class ForceRecord:
                     forces.append((heard_ns, force_n[2] - zero_n if good else math.nan))
             if arm is not None and (not poses or arm.time_ns > poses[-1][0]):
                 poses.append((arm.time_ns, *arm.position_m, *arm.rotation_rad))
+            self._came.notify_all()
+
+    def reaches(self, time_ns: int, within_s: float) -> bool:
+        """Whether a period of that time or later has been taken, within so long from now."""
+        with self._came:
+            return self._came.wait_for(lambda: self._now_ns >= time_ns, within_s)
 
     def over(self, t0_ns: int, t1_ns: int) -> ForceOver:
         """Return what is known of the interval from `t0_ns` to `t1_ns`.

@@ -6,11 +6,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.task import Future
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
@@ -21,7 +21,7 @@ from tactile_resonance.contact.force_spread import ForceRecord
 from tactile_resonance.contact.goal import TARED, State
 from tactile_resonance.contact.resonance_touch import PolesTouch
 from tactile_resonance.contact.samples import WrenchSample
-from tactile_resonance.nodes.managed_node import ManagedNode
+from tactile_resonance.nodes.managed_node import ManagedNode, in_thread
 from tactile_resonance.nodes.messages import (
     contact_state,
     tip_pose,
@@ -42,8 +42,6 @@ SAID_AGAIN_S = 0.1
 """While simulated time stands the state is published again after so long, by this machine's clock [s]."""
 WAIT_S = 0.2
 """An answer waits so long for the loop to come to the end of its block, on the machine's clock [s]."""
-LOOK_EVERY_S = 0.1
-"""While answers wait it is looked so often whether one has waited too long [s]."""
 IN_AIR = (State.IDLE, State.TRAVEL, State.TARE)
 FORGOTTEN_NS = 1_000_000_000
 """So long after the tip left the tissue a record may still show it: stamps err, and the bench plays ahead."""
@@ -194,14 +192,8 @@ class ForceService:
         base_frame: str,
     ) -> None:
         self._record = ForceRecord(rate_hz, period_s)
-        self._clock, self._base_frame = clock, base_frame
+        self._node, self._clock, self._base_frame = node, clock, base_frame
         self._state, self._bias_n = State.IDLE, (0.0, 0.0, 0.0)
-        self._now_ns, self._awaited_ns = 0, math.inf
-        self._waiting: list[tuple[int, float, Future]] = []  # end [ns], deadline [s]
-        self._guard = node.create_guard_condition(self._look)
-        node.resources.callback(node.destroy_guard_condition, self._guard)
-        self._timer = node.every(LOOK_EVERY_S, self._look)
-        self._timer.cancel()
         node.serve(ForceOver, "force_over", self._on_request)
 
     def take(self, cycle: Cycle) -> None:
@@ -211,22 +203,7 @@ class ForceService:
             self._record.restart(cycle.bias_std_n)
         valid = cycle.state in TARED and cycle.fault is None
         self._record.add(cycle.time_ns, cycle.wrenches, cycle.bias_n, cycle.arm, valid=valid)
-        self._state, self._now_ns = cycle.state, cycle.time_ns
-        if cycle.time_ns >= self._awaited_ns:
-            self._awaited_ns = math.inf
-            self._guard.trigger()
-
-    def _look(self) -> None:
-        """Answer requests whose block is over by now, and those that have waited too long."""
-        now_s = time.monotonic()
-        for entry in list(self._waiting):
-            end_ns, deadline_s, future = entry
-            if end_ns <= self._now_ns or now_s > deadline_s:
-                self._waiting.remove(entry)
-                future.set_result(None)
-        self._awaited_ns = min((end_ns for end_ns, _, _ in self._waiting), default=math.inf)
-        if not self._waiting:
-            self._timer.cancel()
+        self._state = cycle.state
 
     async def _on_request(
         self, request: ForceOver.Request, response: ForceOver.Response
@@ -239,13 +216,9 @@ class ForceService:
         if not start_ns < end_ns:
             return write_force_over(response, "the interval is empty")
         # while nothing is under way the loop looks seldom, and there is no force to wait for
-        if end_ns > self._now_ns and self._state is not State.IDLE:
-            future: Future = Future()
-            self._waiting.append((end_ns, time.monotonic() + WAIT_S, future))
-            self._awaited_ns = min(self._awaited_ns, end_ns)
-            self._timer.reset()
-            self._look()  # the loop may have come there meanwhile
-            await future
+        if not self._record.reaches(end_ns, 0.0) and self._state is not State.IDLE:
+            wait = partial(self._record.reaches, end_ns, WAIT_S)
+            await in_thread(self._node, wait, "force_over")
         over = self._record.over(start_ns, end_ns)
         idle = self._state is State.IDLE and over.reason
         reason = "no contact was under way" if idle else over.reason
