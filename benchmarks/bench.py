@@ -20,7 +20,7 @@ import scipy.signal
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.multisine import Excitation, design_multisine
 from tactile_resonance.simulation.plant.tip import SprungIndenter
-from tactile_resonance.simulation.sensor.bench import BenchEffects, SimulatedBench
+from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
 from tactile_resonance.simulation.sensor.response import Lines, ResponseStream, sample_period
@@ -92,7 +92,7 @@ def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, flo
         return scipy.fft.rfft(u), scipy.fft.rfft(y)
 
     def creep() -> object:
-        run = setup.bench.start_varying(setup.creeping, effects=IDEAL)
+        run = BenchRun(setup.bench.sensor, setup.creeping, effects=IDEAL)
         return run.block(setup.excitation, PERIODS)
 
     def lsim() -> object:

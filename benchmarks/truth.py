@@ -257,7 +257,7 @@ def _creep_row(name: str, blocks: int, count: int) -> str:
     middle = {"force_n": CREEP_FORCE_N, "hold_time_s": HELD_FROM_S + length_s / 2}
     found, constant = [], []
     for seed in range(count):
-        found.append(_poles_of(bench.start_varying(creeping, seed=seed), blocks, seed))
+        found.append(_poles_of(BenchRun(bench.sensor, creeping, seed=seed), blocks, seed))
         constant.append(_poles_of(bench.start(tissue, seed=seed, **middle), blocks, seed))
     errors, rates, inside, instants = [], [], [], []
     for poles in found:

@@ -105,6 +105,15 @@ class BenchRun:
 
     The state of the sensor carries over from block to block and from excitation to excitation.
     Playing the same excitation again continues its periods; another one starts a new realisation.
+
+    Parameters
+    ----------
+    sensor : SensorParameters
+    coupled : CoupledBimorph or callable
+        The linear sensor; of a contact that changes that at each time [s] since the start, asked for no time
+        beyond the block that is made. The nonlinearity is not modelled on such a contact.
+    seed, effects
+        As in `SimulatedBench.start`.
     """
 
     def __init__(
@@ -289,24 +298,6 @@ class SimulatedBench:
         """
         coupled = self.coupled(tissue, force_n=force_n, hold_time_s=hold_time_s)
         return BenchRun(self.sensor, coupled, seed, effects)
-
-    def start_varying(
-        self,
-        coupled_at: Callable[[float], CoupledBimorph],
-        *,
-        seed: int = 0,
-        effects: BenchEffects = DEFAULT_EFFECTS,
-    ) -> BenchRun:
-        """Return a run whose linear sensor at each time [s] since its start is that of `coupled_at`.
-
-        It is asked for no time beyond the block that is made.
-
-        Raises
-        ------
-        ValueError
-            If the nonlinearity is asked for: it is not modelled on a changing contact.
-        """
-        return BenchRun(self.sensor, coupled_at, seed, effects)
 
 
 @dataclass(frozen=True)

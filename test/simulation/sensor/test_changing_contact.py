@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 from tactile_resonance.simulation.sensor.bench import (
     BenchEffects,
+    BenchRun,
     BenchTip,
     ContactSoFar,
 )
@@ -121,7 +122,7 @@ def test_contact_at_rest_is_the_exact_response(bench, library, multisine, silenc
     at_rest = bench.coupled(library["liver"])
     for skew in (0.0, 1.3e-4, -1e-5):
         effects = replace(IDEAL, channel_skew_s=skew)
-        found = bench.start_varying(lambda time_s: at_rest, effects=effects)
+        found = BenchRun(bench.sensor, lambda time_s: at_rest, effects=effects)
         expected = bench.start(library["liver"], effects=effects)
         for run in (found, expected):
             run.block(lines)
@@ -147,7 +148,7 @@ def test_state_carried_to_another_contact_and_back_is_the_same(sensor, library, 
 
 
 def test_truth_of_a_run_follows_the_contact(bench, library):
-    run = bench.start_varying(creeping(bench, library["cortex"]))
+    run = BenchRun(bench.sensor, creeping(bench, library["cortex"]))
     early, late = (run.truth(time_s=t) for t in (0.0, 3.2))
     assert late.mode_near(250).f0_hz - early.mode_near(250).f0_hz == pytest.approx(-0.73, abs=0.03)
     assert late.contact.contact_radius_m > early.contact.contact_radius_m
@@ -156,8 +157,10 @@ def test_truth_of_a_run_follows_the_contact(bench, library):
 
 def test_a_nonlinear_sensor_on_a_changing_contact_is_refused(bench, library):
     with pytest.raises(ValueError, match="nonlinearity.*off"):
-        bench.start_varying(
-            creeping(bench, library["gel10"]), effects=BenchEffects(nonlinearity=True)
+        BenchRun(
+            bench.sensor,
+            creeping(bench, library["gel10"]),
+            effects=BenchEffects(nonlinearity=True),
         )
 
 
@@ -216,7 +219,7 @@ def test_a_run_on_it_is_that_of_each_contact(bench, library, multisine):
     tip = BenchTip(gel, 0.01, 1.0, start.contact_radius_m, start.indentation_m)
     so_far, excitation = ContactSoFar(bench, tip), multisine(1)
     still = bench.start(gel, seed=3)
-    following = bench.start_varying(so_far.coupled_at, seed=3)
+    following = BenchRun(bench.sensor, so_far.coupled_at, seed=3)
     period_s = excitation.samples_per_period / excitation.sample_rate_hz
     expected = list(still.play(excitation, 2))
     found = following.play(excitation, 2)
