@@ -92,7 +92,7 @@ def _stream(config: CanForce, cell: Cell, seconds: float) -> str:
     elapsed_s = time.monotonic() - begin_s
     own, its = cpu_s(os.getpid()) - own, cpu_s(cell.process.pid) - its
     count, lost = source.received - first, source.lost
-    clock_s = source.info.clock_uncertainty_s
+    clock_s = source.clock_uncertainty_s
     source.close()
     # the cell sends one each millisecond of its own clock, which the stamps follow
     sent = round((stamps[-1] - stamps[0]) * 1e-6) + 1

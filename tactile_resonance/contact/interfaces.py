@@ -136,8 +136,6 @@ class ForceInfo:
     rate_hz : float
     noise_rms_n, resolution_n, range_n : float
         Noise of one sample, smallest step, largest force [N].
-    clock_uncertainty_s : float
-        Standard deviation of `CellSample.time_ns` against this machine's clock [s].
     """
 
     name: str
@@ -145,7 +143,6 @@ class ForceInfo:
     noise_rms_n: float
     resolution_n: float
     range_n: float
-    clock_uncertainty_s: float = 0.0
 
 
 class Cell(Protocol):
@@ -229,11 +226,6 @@ class NodeArm(Arm, Protocol):
     @property
     def clock(self) -> Clock:
         """Clock on which its states are dated."""
-        ...
-
-    @property
-    def clock_uncertainty_s(self) -> float:
-        """Standard deviation of `ArmSample.time_ns` against `clock` [s]. Raises `ArmError`."""
         ...
 
     @property

@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from dataclasses import replace
 from operator import mul
 
 import can
@@ -14,7 +13,7 @@ import can
 from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.clocks import STEP_S, ClockTracker
-from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
+from tactile_resonance.contact.interfaces import ForceError, ForceFault
 from tactile_resonance.contact.payload import Mounting
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.can_bus import (
@@ -58,7 +57,7 @@ class CanWrench:
 
     def __init__(self, config: CanForce, clock: Clock | None = None) -> None:
         self.mounting: Mounting = config
-        self._config = config
+        self._config, self.info = config, config.info
         self.clock: Clock = WallClock() if clock is None else clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._bus: Bus | None = None
@@ -76,10 +75,9 @@ class CanWrench:
         self._begin()
 
     @property
-    def info(self) -> ForceInfo:
-        """What the cell can do, and how well its times are known at present."""
-        std_s = self._tracker.uncertainty_s if self._stamped else self._config.delay_std_s
-        return replace(self._config.info, clock_uncertainty_s=std_s)
+    def clock_uncertainty_s(self) -> float:
+        """Standard deviation of the times of its wrenches against this machine's clock, at present [s]."""
+        return self._tracker.uncertainty_s if self._stamped else self._config.delay_std_s
 
     @property
     def lost(self) -> int:

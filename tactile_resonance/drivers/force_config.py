@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -248,19 +248,11 @@ class RtdeWrench:
                 "mount, frame, payload: expected tool, zeros and none, the controller knows them"
             )
         self.mounting: Mounting = config
+        self.info = config.info
         self._config, self._arm, self._clock = config, arm, arm.clock
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
         self._robot_time_s = -math.inf
         self._new_s = 0.0
-
-    @property
-    def info(self) -> ForceInfo:
-        """What the sensor can do; the uncertainty of its clock is NaN while the arm is not connected."""
-        try:
-            std_s = self._arm.clock_uncertainty_s
-        except ArmError:
-            std_s = float("nan")
-        return replace(self._config.info, clock_uncertainty_s=std_s)
 
     def start(self) -> None:
         """Begin anew; the arm is connected by its owner. Raises `ForceError`."""

@@ -12,7 +12,7 @@ from rclpy.node import Node
 
 from tactile_resonance.clock import Clock, WallClock
 from tactile_resonance.contact.cell_checks import CellChecks
-from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
+from tactile_resonance.contact.interfaces import ForceError, ForceFault
 from tactile_resonance.contact.payload import Mounting
 from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.force_config import TopicForce
@@ -60,7 +60,7 @@ class TopicWrench:
 
     def __init__(self, node: Node, config: TopicForce, clock: Clock | None = None) -> None:
         self.mounting: Mounting = config
-        self._node, self._config = node, config
+        self._node, self._config, self.info = node, config, config.info
         self._clock: Clock = WallClock() if clock is None else clock
         self.arrivals = Arrivals()
         self._checks = CellChecks(config.info, config.range_nm, config.limits)
@@ -71,11 +71,6 @@ class TopicWrench:
         self._frame_id: str | None = None  # of the first wrench
         self._listening = False
         self._subscription = None
-
-    @property
-    def info(self) -> ForceInfo:
-        """What the sensor can do, as configured; its clock is taken to be this machine's."""
-        return self._config.info
 
     def start(self) -> None:
         """Subscribe again; without a wrench in the next two seconds it counts as silent."""

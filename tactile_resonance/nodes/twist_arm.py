@@ -175,8 +175,6 @@ class TwistArm:
     """
 
     waits_for = ""
-    clock_uncertainty_s = 0.0
-    """The stamps are taken to be of this machine's clock, or of one that is kept with it."""
 
     def __init__(self, node: ManagedNode, config: TwistConfig, base_frame: str) -> None:
         self.config, self._base_frame = config, base_frame

@@ -161,8 +161,6 @@ class HandClock:
 class States:
     """An arm that hands out a state; None: it raises."""
 
-    clock_uncertainty_s = 0.0
-
     def __init__(self):
         self.clock = HandClock()
         self.now = self.at(1.0, [0.0] * 6)
@@ -193,22 +191,6 @@ def test_the_wrench_is_turned_into_the_frame_of_the_tip():
 def test_a_wrench_of_the_tip_is_not_taken_for_one_under_the_sample():
     with pytest.raises(ValueError, match="mount, frame, payload: expected tool"):
         RtdeWrench(replace(CONFIG, mount=Mount.TABLE), States())
-
-
-def test_it_can_be_made_before_the_arm_is_connected():
-    connected = []
-
-    class Arm(States):
-        @property
-        def clock_uncertainty_s(self):
-            if not connected:
-                raise ArmError(ArmFault.LINK_LOST, "not connected")
-            return 2e-4
-
-    source = force_source(CONFIG, Arm())
-    assert np.isnan(source.info.clock_uncertainty_s)
-    connected.append(True)
-    assert source.info.clock_uncertainty_s == 2e-4
 
 
 @pytest.mark.parametrize(
