@@ -134,6 +134,12 @@ class ForceWatch:
         return self._sum_n / len(self._averaged) if self._full else None
 
     @property
+    def newest_n(self) -> float:
+        """Mean of the three newest forces along z, less the bias [N]; of as many as there are since."""
+        forces = list(self._forces_n)[-3:]
+        return sum(forces) / max(1, len(forces))
+
+    @property
     def mean_count(self) -> int:
         """Of forces in `mean_n`."""
         return len(self._averaged)
@@ -267,8 +273,9 @@ class Envelope:
         if z > limits.abort_force_n:
             text = f"{1e3 * z:.1f} mN on the tip, limit {1e3 * limits.abort_force_n:g} mN"
             return Breach(Cause.FORCE_ABORT, text)
-        if z < -limits.pull_force_n:
-            text = f"{1e3 * z:.1f} mN against the pressing direction"
+        newest_n = watch.newest_n  # the noise of one force may be a quarter of this limit
+        if newest_n < -limits.pull_force_n:
+            text = f"{1e3 * newest_n:.1f} mN against the pressing direction"
             return Breach(Cause.FORCE_PULL, f"{text}, limit {1e3 * limits.pull_force_n:g} mN")
         lateral = math.hypot(x, y)
         if lateral > limits.lateral_force_n:

@@ -152,15 +152,9 @@ class FreeMotion:
 
     def tare(self, now_ns: int, arm: ArmSample) -> Move:
         """At rest for the zero of the force."""
-        speed = math.hypot(*arm.velocity[:3])
         observer = self._observer
-        if observer.taring:
-            # not before: a tool on the cell has to come to rest
-            touched = self._touched("at the standoff, before its zero was known")
-            if touched is not None:
-                return touched
         if not observer.taring:
-            if speed > STILL_M_S:
+            if math.hypot(*arm.velocity[:3]) > STILL_M_S:
                 self._still_ns = -1
             elif self._still_ns < 0:
                 self._still_ns = now_ns
@@ -168,12 +162,13 @@ class FreeMotion:
                 observer.begin_tare()
                 self._travel_force_n = None
                 self._tare_ns = now_ns
-        elif now_ns - self._tare_ns >= 1e9 * self._parameters.tare_s:
-            breach = observer.end_tare(now_ns)
-            if breach is None:
-                return Move(None, State.APPROACH)
-            return Move(None, State.FAULT, breach)
-        return REST
+            return REST
+        # not before: a tool on the cell has to come to rest
+        touched = self._touched("at the standoff, before its zero was known")
+        if touched is not None or now_ns - self._tare_ns < 1e9 * self._parameters.tare_s:
+            return touched or REST
+        breach = observer.end_tare(now_ns)
+        return Move(None, State.APPROACH if breach is None else State.FAULT, breach)
 
     def _touched(self, where: str) -> Move | None:
         """Result where something pushes: without a zero only a change of the force shows that."""

@@ -190,6 +190,8 @@ def watched(forces, period_ns=2_000_000, mean_s=0.02):
         ([[0, 0, 0.0301]], Cause.FORCE_ABORT),
         ([[0, 0, 0.0501]], Cause.FORCE_HARD),
         ([[0, 0, -0.0081]], Cause.FORCE_PULL),
+        ([[0, 0, 0.0]] * 3 + [[0, 0, -0.0081]] * 3, Cause.FORCE_PULL),
+        ([[0, 0, 0.0]] * 3 + [[0, 0, -0.0081]] * 2, None),  # noise of a cell for 20 mN
         ([[0.011, 0.011, 0.01]], Cause.FORCE_LATERAL),
         ([[0, 0, 0.0]] * 8 + [[0, 0, 0.02]] * 3, Cause.FORCE_RATE),
         ([[0, 0, 0.02]] * 8 + [[0, 0, 0.0]] * 3, Cause.FORCE_RATE),
