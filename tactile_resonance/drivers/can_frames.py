@@ -219,7 +219,8 @@ class Assembler:
     def __init__(self, frame_ids: tuple[int, ...], within_s: float) -> None:
         self._place_of = {can_id: place for place, can_id in enumerate(frame_ids)}
         self._within_s, self._first_s = within_s, 0.0
-        self._joined, self._count = b"", 0  # so far, and of how many frames
+        self._place = -1  # of the newest frame
+        self._joined, self._count = b"", 0  # so far, and of how many frames; -1: one is missing
         self.lost = 0
 
     def add(self, can_id: int, data: bytes, time_s: float) -> bytes | None:
@@ -230,16 +231,16 @@ class Assembler:
         place = self._place_of.get(can_id)
         if place is None:
             return None
-        if place != self._count or (place and not abs(time_s - self._first_s) <= self._within_s):
-            self.lost += 1
-            self._count = 0
+        if place <= self._place or not abs(time_s - self._first_s) <= self._within_s:
+            self.lost += self._count > 0
+            self._first_s, self._joined, self._count = time_s, b"", 0
+        self._place = place
         if place != self._count:
+            self.lost += self._count >= 0
+            self._count = -1
             return None
-        if place == 0:
-            self._first_s, self._joined = time_s, data
-        else:
-            self._joined += data
-        self._count = place + 1
+        self._joined += data
+        self._count += 1
         if self._count < len(self._place_of):
             return None
         self._count = 0

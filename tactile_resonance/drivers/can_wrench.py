@@ -257,7 +257,7 @@ class CanWrench:
                     samples.append(sample)
                     self._last_stamp_s = stamp_s
             elif can_id in ids:
-                if assembler.lost > lost:
+                while assembler.lost > lost:
                     lost += 1
                     self._checks.lost()
             elif can_id & ERROR:

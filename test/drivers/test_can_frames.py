@@ -44,18 +44,20 @@ def test_answers_to_commands_are_no_wrenches():
     assert ROBOTOUS.decode(bytes(8)) is None
 
 
-@given(st.lists(st.integers(0, 40), max_size=15, unique=True))
-def test_whatever_frames_are_lost_no_wrench_mixes_two(missing):
-    assembler = Assembler((1, 2), 5e-4)
+@given(st.integers(1, 4), st.sets(st.integers(0, 80), max_size=20))
+def test_no_wrench_mixes_two_and_each_that_lacks_a_frame_counts_once(n, missing):
+    assembler = Assembler(tuple(range(1, n + 1)), 5e-4)
     whole = []
     for i in range(20):
-        for j, can_id in enumerate((1, 2)):
-            if 2 * i + j not in missing:
-                joined = assembler.add(can_id, bytes([i]), 1e-3 * i + 1.3e-4 * j)
+        for j in range(n):
+            if n * i + j not in missing:
+                joined = assembler.add(j + 1, bytes([i]), 1e-3 * i + 1.3e-4 * j)
                 whole += [joined] if joined else []
         assert assembler.add(7, b"x", 1e-3 * i) is None  # another device's
-    complete = [i for i in range(20) if not {2 * i, 2 * i + 1} & set(missing)]
-    assert whole == [bytes([i, i]) for i in complete]
+    assembler.add(1, b"", 1.0)  # what comes next shows that the last one is not whole
+    lacking = [len(missing.intersection(range(n * i, n * i + n))) for i in range(20)]
+    assert whole == [bytes([i] * n) for i in range(20) if not lacking[i]]
+    assert assembler.lost == sum(0 < lacks < n for lacks in lacking)
 
 
 def test_lost_wrenches_are_counted():
