@@ -299,9 +299,12 @@ def hum(x: _Channel) -> Fault | None:
         for hz, alike, near in places[mains]:
             standing = 0.0
             for around, peak, limit in alike:
-                floor = np.median(power[around]) / np.log(2)  # mean of an exponential distribution
-                if power[peak].max() > max(2 * limit * floor, rounding):
-                    standing += float(power[peak].sum())
+                on, beside = power[peak], power[around]
+                most = on.max() * math.log(2) / (2 * limit)  # the median of an exponential distribution
+                # a median takes twenty times as long as to count, which rules nearly all out
+                enough = on.max() > rounding and 2 * np.count_nonzero(beside < most) >= beside.size
+                if enough and np.median(beside) < most:
+                    standing += float(on.sum())
             if standing:
                 peaks.append((hz, standing, near))
         # the fundamental may be hidden, a single high harmonic may be anything
