@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -36,8 +35,9 @@ FEWEST_LINES = 8
 LEAST_TURN, SPOILING_TURN = 1e-3, 0.1
 """Phase [rad] that the actuator's highest line shifts by over a record: seen, and too far."""
 MAINS_HARMONICS = 5
-_HUM_FLOOR_BINS = (10, 40)  # distance from the mains frequency at which the floor is taken
 _FALSE_ALARM = 1e-4
+_TONE = 25.0
+"""Power of a bin over the mean of ten beside: of noise 18 in one of 1e4 records, 1/3 of them each bin."""
 
 
 class FaultKind(Enum):
@@ -284,84 +284,69 @@ def _spread_of_noise(x: _Channel) -> float:
 def hum(x: _Channel) -> Fault | None:
     """Mains frequency and its harmonics, at bins that are not excited.
 
-    Spoils the FRF only where an excited line lies within the bins that the local polynomial method
-    draws on. Records shorter than ten periods of the mains are not tested: a resonance that starts from rest
-    stands out of their floor as hum does. Hum that falls exactly on a harmonic of several periods cannot be
-    seen: it looks like excitation or distortion.
+    A tone stands out of all bins beside it; the skirt of a mode that rings elsewhere does not, nor a mode that
+    dies out within the record. Spoils the FRF only where an excited line lies within the bins that the local
+    polynomial method draws on. Records shorter than ten periods of the mains are not tested. Hum that falls
+    exactly on a harmonic of several periods cannot be seen: it looks like excitation or distortion.
     """
     lines = np.asarray(x.harmonics, np.int64).tobytes()
-    count, places = _hum_places(x.sample_rate_hz, *x.samples.shape, lines)
-    power = 2 * np.abs(x.bins[:count]) ** 2  # mean square per bin
-    rounding = ROUNDING * x.rms**2
-    found: list[tuple[float, float, bool]] = []
+    at, hz, mains_hz, beside, near = _hum_places(x.sample_rate_hz, *x.samples.shape, lines)
+    if not at.size:
+        return None
+    power = 2 * np.abs(x.bins[: int(beside.max()) + 1]) ** 2  # mean square per bin
+    around = power[beside]  # (B, 16)
+    level = np.maximum(_TONE * around[:, 6:].mean(axis=1), around.max(axis=1))
+    stands = power[at] > np.maximum(level, ROUNDING * x.rms**2)
+    found: list[float] = []
     for mains in MAINS_HZ:
-        peaks = []
-        for hz, alike, near in places[mains]:
-            standing = 0.0
-            for around, peak, limit in alike:
-                on, beside = power[peak], power[around]
-                most = on.max() * math.log(2) / (2 * limit)  # the median of an exponential distribution
-                # a median takes twenty times as long as to count, which rules nearly all out
-                enough = on.max() > rounding and 2 * np.count_nonzero(beside < most) >= beside.size
-                if enough and np.median(beside) < most:
-                    standing += float(on.sum())
-            if standing:
-                peaks.append((hz, standing, near))
+        seen = np.unique(hz[stands & (mains_hz == mains)])
         # the fundamental may be hidden, a single high harmonic may be anything
-        if peaks and (peaks[0][0] == mains or len(peaks) > 1):
-            found += peaks
+        if seen.size > 1 or mains in seen:
+            found += seen.tolist()
     if not found:
         return None
-    rms = float(np.sqrt(sum(line[1] for line in found)))
-    names = ", ".join(f"{line[0]:g}" for line in found)
+    of = np.isin(hz, found)
+    rms = float(np.sqrt(power[np.unique(at[of])].sum()))
+    names = ", ".join(f"{tone:g}" for tone in found)
     text = f"Mains hum in the {x.name} at {names} Hz, at least {rms:.2g} V rms"
-    return x.fault(FaultKind.HUM, rms, any(line[2] for line in found), text)
+    if spoils := bool(near[of].any()):
+        text += ", or a mode that rings on there"
+    return x.fault(FaultKind.HUM, rms, spoils, text)
 
 
 @lru_cache(maxsize=16)
 def _hum_places(
     sample_rate_hz: float, periods: int, samples: int, harmonics: bytes
-) -> tuple[int, dict[float, list[tuple[float, list[tuple[IntArray, IntArray, float]], bool]]]]:
-    """How many bins hum needs, and where it shows, by mains frequency.
+) -> tuple[np.ndarray, ...]:
+    """Where hum shows: bins (B,), their tone and mains frequency [Hz], bins beside, whether a line is near.
 
-    Each a frequency [Hz], bins around it and on it with the limit of the largest of these over the mean of
-    those, and whether an excited line is near; `harmonics` are bytes of int64. Bins of a single period are
-    harmonics: those of odd and of even order, which hold distortion of their own, are compared apart.
+    Beside (B, 16) are the nearest three on either side from two bins away on, and five from five bins away on.
+    `harmonics` are bytes of int64. Bins of a single period are harmonics: those of odd and of even order, which
+    hold distortion of their own, are compared apart.
     """
     resolution = sample_rate_hz / (periods * samples)
-    highest = MAINS_HARMONICS * max(MAINS_HZ) / resolution + _HUM_FLOOR_BINS[1]
-    count = min(math.ceil(highest), periods * samples // 2) + 1
-    excited = np.zeros(count, bool)
-    lines = np.frombuffer(harmonics, np.int64) * periods
-    excited[lines[lines < count]] = True
-    usable = ~excited
+    count = periods * samples // 2 + 1
+    usable = np.ones(count, bool)
+    usable[np.frombuffer(harmonics, np.int64) * periods] = False
+    excited = np.flatnonzero(~usable)
+    usable[0] = False
     if periods > 1:
         usable[::periods] = False  # harmonics not excited may hold distortion
-    # the floor is taken where leakage of the hum has died out
-    away = np.arange(*_HUM_FLOOR_BINS)
-    places: dict[float, list] = {mains: [] for mains in MAINS_HZ}
-    for mains in MAINS_HZ:
-        if _HUM_FLOOR_BINS[0] * resolution > mains:
-            continue  # the floor would lie beyond the next harmonic, where the response is another one
-        for k in range(1, MAINS_HARMONICS + 1):
-            centre = round(k * mains / resolution)
-            around, peak = (
-                at[(at > 0) & (at < count)]
-                for at in (centre + np.concatenate([-away, away]), centre + np.arange(-1, 2))
-            )
-            around, peak = around[usable[around]], peak[usable[peak]]
-            orders = 2 if periods == 1 else 1
-            alike = []
-            for order in range(orders):
-                beside, on = around[around % orders == order], peak[peak % orders == order]
-                if beside.size >= 8 and on.size:
-                    # the floor of a few bins is itself uncertain
-                    limit = special.fdtri(2, 2 * beside.size, 1 - _FALSE_ALARM / peak.size)
-                    alike.append((beside, on, float(limit)))
-            if alike:
-                near = bool(np.any(excited[max(0, centre - 5) : centre + 6]))
-                places[mains].append((k * mains, alike, near))
-    return count, places
+    rows = []
+    # of shorter records the bins beside lie at the next harmonic, where the response is another one
+    for mains in (hz for hz in MAINS_HZ if 10 * resolution <= hz):
+        for hz in mains * np.arange(1, MAINS_HARMONICS + 1):
+            centre = round(hz / resolution)
+            near = bool(np.any(np.abs(excited - centre) <= 5))
+            for at in np.arange(centre - 1, centre + 2):
+                alike = np.arange(max(at - 30, 0), min(at + 31, count))
+                alike = alike[usable[alike] & ((alike - at) % (2 if periods == 1 else 1) == 0)]
+                off = alike - at
+                beside = [*alike[off < -4][-5:], *alike[off > 4][:5]]
+                close = [*alike[off < -1][-3:], *alike[off > 1][:3]]
+                if 0 in off and len(beside) == 10:
+                    rows.append((at, hz, mains, close + beside, near))
+    return tuple(np.array(column) for column in (zip(*rows, strict=True) if rows else [()] * 5))
 
 
 def lost_samples(x: _Channel) -> Fault | None:

@@ -246,6 +246,21 @@ def test_a_resonance_that_starts_from_rest_is_no_hum(periods, multisine):
     assert FaultKind.HUM not in kinds(report)
 
 
+@pytest.mark.parametrize("f0_hz", [45.3, 54.1, 56.7, 63.2, 65.0, 114.0, 144.5])
+@pytest.mark.parametrize("periods", [1, 2, 4])
+def test_a_mode_that_rings_beside_the_mains_is_no_hum(f0_hz, periods, multisine):
+    """From rest: before, hum at 50 or 60 Hz in all records of modes that near."""
+    harmonics = np.arange(16, 80, 2 if periods == 1 else 1) * (4 // min(periods, 4))
+    u = np.tile(multisine(harmonics, 8000 // periods, np.random.default_rng(3), amplitude=0.1), periods)
+    for damping in (3e-4, 3e-3, 0.02):
+        pole = np.exp(2 * np.pi * (-damping + 1j) * f0_hz / 5e3)
+        y = signal.lfilter([1 - abs(pole)], [1, -2 * pole.real, abs(pole) ** 2], u)
+        y += 1e-3 * y.std() * np.random.default_rng(4).standard_normal(y.size)
+        record = Spectrum.of(u.reshape(periods, -1), y.reshape(periods, -1))
+        report = find_faults(record, sample_rate_hz=5e3, harmonics=harmonics)
+        assert FaultKind.HUM not in kinds(report), (damping, report.message)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_what_rounding_leaves_is_no_hum(seed):
     """Records without noise: before, hum of 1e-17 V."""
