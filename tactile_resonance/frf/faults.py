@@ -44,7 +44,7 @@ class FaultKind(Enum):
     """What is wrong with a record."""
 
     MISSING_SAMPLES = "missing samples"
-    LOST_SAMPLES = "samples lost between periods"
+    LOST_SAMPLES = "samples lost"
     CLOCKS = "clocks of generator and converter differ"
     SATURATION = "saturation"
     OFFSET = "offset"
@@ -350,7 +350,7 @@ def _hum_places(
 
 
 def lost_samples(x: _Channel) -> Fault | None:
-    """Periods shifted against each other: samples were lost between them."""
+    """Periods shifted against each other: samples were lost between or within them."""
     # the first period may hold a transient: with three others it is left out
     start = 1 if x.periods > 2 else 0
     if x.periods - start < 2:
@@ -361,7 +361,7 @@ def lost_samples(x: _Channel) -> Fault | None:
     # all lines alike, so that the peak of the correlation is sharp
     cross = np.divide(cross, magnitude, out=np.zeros_like(cross), where=magnitude > 0)
     if np.all(2 * np.abs(cross.real.sum(axis=-1)) >= np.count_nonzero(cross, axis=-1)):
-        return None  # the correlation at no shift is at least half of what it can be at any
+        return _few_lost(x)  # the correlation at no shift is at least half of what it can be at any
     spectra = np.zeros((cross.shape[0], x.by_period.shape[1]), complex)
     spectra[:, x.harmonics] = cross
     samples = x.samples.shape[1]
@@ -376,7 +376,43 @@ def lost_samples(x: _Channel) -> Fault | None:
         return None
     worst = int(shift[np.argmax(np.abs(shift))])
     text = f"Periods of the {x.name} are shifted by {worst} samples: some were lost in between"
+    if x.name == "sensor":  # turns neighbouring lines alike
+        text += ", or a mode rings through them"
     return x.fault(FaultKind.LOST_SAMPLES, abs(worst), True, text)
+
+
+def _few_lost(x: _Channel) -> Fault | None:
+    """Samples lost at one place, less than half a cycle of the fastest line.
+
+    What was sampled within one period before that place, and nothing else, differs from what follows one
+    period later; it does not from what follows so many samples less.
+    """
+    start, samples = 0 if x.name == "actuator" else 1, x.samples.shape[1]
+    record = x.samples[start:].ravel()
+    if record.size < 3 * samples or samples < 64:
+        return None
+    edges = np.arange(0, record.size - samples, samples // 8)
+    power = np.add.reduceat((record[samples:] - record[:-samples]) ** 2, edges)
+    level = np.partition(power, power.size // 4)[power.size // 4]
+    high = np.flatnonzero(power > 3 * level)
+    if not 1 < high.size <= high[-1] - high[0] + 1 <= 9:
+        return None
+    # the first and the last may differ in part only
+    inner = high[1:-1] if high.size > 2 else high
+    at = np.arange(edges[inner[0]], np.append(edges, record.size - samples)[inner[-1] + 1])
+    most = min(samples // (2 * int(x.harmonics[-1])) + 1, samples // 8)
+    shifts = np.arange(-most, most + 1)
+    rest = [np.sum((record[at + samples] - record[np.maximum(at + k, 0)]) ** 2) for k in shifts]
+    lost = int(shifts[np.argmin(rest)])
+    if lost == 0 or min(rest) > max(2 * level * at.size / (samples // 8), rest[most] / 100):
+        return None
+    place = edges[high[0]] + samples if high[0] else edges[high[-1]]
+    seconds = (place + (start + 1 / 16) * samples) / x.sample_rate_hz
+    what = "lost" if lost > 0 else "doubled"
+    text = f"The {x.name} shifts by {abs(lost)} samples at about {seconds:.3g} s: some were {what} there"
+    if x.name == "sensor":
+        text += ", or it was disturbed"
+    return x.fault(FaultKind.LOST_SAMPLES, abs(lost), True, text)
 
 
 def _coherent(
