@@ -19,8 +19,10 @@ from tactile_resonance.poles.noise_level import (
     FALSE_ALARM,
     Pieces,
     are_flat,
+    channels_of,
     flat_limit,
     model_variance,
+    smooth_variance,
 )
 
 if TYPE_CHECKING:
@@ -225,26 +227,36 @@ def with_noise(
     free = size / max(size - problem.sizes[2] * records / 2, 1.0)  # of what the transients have left
     pieces = _pieces_between(data.undriven, records)
     total_power, _ = _by_piece(error, pieces, free)
-    # of an input that is known but for the noise of its voltmeter, which comes in through the response
-    of_u = np.where(generator, _power(response), 0.0) if generator.any() else None
-    rest_power, kind_rest = _by_piece(rest, pieces, free, of_u)
+    rest_power, kind = _by_piece(rest, pieces, free)
     input_power, kind_u = _by_piece(u, pieces, 1.0)
-    measured = np.where(common, total_power, rest_power)
     variance_u = np.where(generator, 0.0, input_power)
+    beside = np.minimum(np.searchsorted(plan.others_at, plan.excited_at), data.undriven - 1)
+    of_excited, rows = pieces.of_bin[beside], np.flatnonzero(generator)
+    of_rest = _on(pieces.of_bin, rest_power)
+    of_y = _on(of_excited, np.where(common, total_power, rest_power))
+    mean = np.concatenate([_mean_power(rest) * free, variance_u.mean(-1, keepdims=True)], -1)
+    kind = np.maximum(kind, np.where(generator[:, 0], 0, kind_u))
+    if rows.size:  # an input that is known but for the noise of its voltmeter, which the response brings in
+        sample, gain = (_power(x[rows]).reshape(rows.size, -1, records).mean(-1) for x in (rest, response))
+        alike = Pieces.of(data.undriven, pieces.size, records)
+        curve, kind[rows] = smooth_variance(sample * free, gain, alike)
+        flat, channels = kind[rows, None] == 0, channels_of(curve, gain)
+        driven = channels[:, :1] + channels[:, 1:] * _power(problem.response(theta[rows, 0]))
+        of_rest = np.tile(of_rest, (1, data.undriven // of_rest.shape[1]))
+        of_y = np.tile(of_y, (1, data.driven // of_y.shape[1]))
+        of_rest[rows], of_y[rows] = curve, np.where(flat, driven, curve[:, beside])
+        mean[rows] = np.where(flat, channels, mean[rows])
     if (generator | common).any():
         y = data.y.copy()
         y[..., others] -= through.reshape(len(y), -1, records).swapaxes(1, 2)
         data = data._replace(y=y)
-    before = np.searchsorted(plan.others_at, plan.excited_at)
-    of_excited = pieces.of_bin[np.minimum(before, data.undriven - 1)]
     weighted = data.weighted(
-        rest=_on(pieces.of_bin, np.where(rest_power > TINY, rest_power, 1.0)),
-        variance_y=_on(of_excited, np.where(measured > TINY, measured, 1.0)),
+        rest=np.where(of_rest > TINY, of_rest, 1.0),
+        variance_y=np.where(of_y > TINY, of_y, 1.0),
         variance_u=_on(of_excited, variance_u),
         covariance_yu=np.where(common, cross, 0.0) if common.any() else np.empty((len(data.y), 0)),
     )
-    mean = np.concatenate([_mean_power(rest) * free, variance_u.mean(-1, keepdims=True)], -1)
-    return weighted, mean, np.maximum(kind_rest, np.where(generator[:, 0], 0, kind_u))
+    return weighted, mean, kind
 
 
 def _bin_by_bin(values: ComplexArray) -> ComplexArray:
@@ -279,24 +291,14 @@ def _powers(
     return power_error, power_u, cross, np.asarray(squared > _correlation_limit(error.shape[1]))
 
 
-def _by_piece(
-    values: ComplexArray, pieces: Pieces, factor: float, gain: FloatArray | None = None
-) -> tuple[FloatArray, IntArray]:
-    """(batch, 1) or (batch, pieces) variance, and its kind as index into `KINDS`.
-
-    Flat unless a test says otherwise; ``a + b gain`` of points with a gain of each value that is not 0.
-    """
+def _by_piece(values: ComplexArray, pieces: Pieces, factor: float) -> tuple[FloatArray, IntArray]:
+    """(batch, 1) or (batch, pieces) variance, flat unless a test says otherwise, and its kind in `KINDS`."""
     mean = _mean_power(values) * factor
     samples = pieces.means(_power(values))
-    if pieces.starts.size < FEWEST_PIECES or (gain is None and bool(are_flat(samples, pieces.dof).all())):
+    if pieces.starts.size < FEWEST_PIECES or bool(are_flat(samples, pieces.dof).all()):
         return mean, np.zeros(mean.shape[0], np.int64)
     model = model_variance(samples * factor, pieces.dof)
-    variance, kind = np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
-    if gain is not None:
-        rows = gain.any(axis=1)
-        both = model_variance(samples[rows] * factor, pieces.dof, pieces.means(gain[rows]))
-        variance[rows], kind[rows] = both.variance, both.kind
-    return variance, kind
+    return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
 
 
 def _power(values: ComplexArray) -> FloatArray:

@@ -22,7 +22,7 @@ from tactile_resonance.poles.drift import poles_with_drift
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator, whole_harmonics
 from tactile_resonance.poles.judgement import single
-from tactile_resonance.poles.noise_level import LEAST_VARIANCE, two_channels
+from tactile_resonance.poles.noise_level import channels_of, two_channels
 from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.poles.tones import poles_without_tones
@@ -301,11 +301,9 @@ def _input_noise_ratio(plan: JointPlan, of_all: PolesBatch) -> float:
     """
     gain = np.abs(of_all.fit.response(plan.frequency_hz)) ** 2
     variance = np.abs(of_all.residual) ** 2 * (1 + (plan.input_noise_ratio or 0.0) * gain)
-    curve = two_channels(variance[None], gain[None], np.zeros(1, bool))[0]
-    low, high = np.argmin(gain), np.argmax(gain)
-    slope = (curve[high] - curve[low]) / max(gain[high] - gain[low], np.finfo(float).tiny)
-    floor = LEAST_VARIANCE * curve.mean()
-    found = slope / max(curve[low] - slope * gain[low], floor, np.finfo(float).tiny)
+    curve = two_channels(variance[None], gain[None], np.zeros(1, bool))
+    of_y, of_u = channels_of(curve, gain[None])[0]
+    found = of_u / max(of_y, np.finfo(float).tiny)
     return float(found) if np.isfinite(found) else 0.0  # of a fit that failed
 
 

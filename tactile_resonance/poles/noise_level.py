@@ -336,6 +336,14 @@ def two_channels(variance: FloatArray, gain: FloatArray, sloped: BoolArray) -> F
     return model
 
 
+def channels_of(variance: FloatArray, gain: FloatArray) -> FloatArray:
+    """(batch, 2) a and b of variances ``a + b gain`` (batch, F)."""
+    ends = np.stack([np.argmin(gain, axis=1), np.argmax(gain, axis=1)], axis=1)
+    v, g = np.take_along_axis(variance, ends, 1), np.take_along_axis(gain, ends, 1)
+    b = (v[:, 1] - v[:, 0]) / np.maximum(g[:, 1] - g[:, 0], TINY)
+    return np.stack([np.maximum(v[:, 0] - b * g[:, 0], LEAST_VARIANCE * variance.mean(axis=1)), b], axis=1)
+
+
 @entry
 def _two_channels(variance, gain, sloped, model):
     """Put what `two_channels` gives into the last."""

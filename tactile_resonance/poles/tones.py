@@ -115,8 +115,8 @@ class _Fitted:
         return np.asarray(self.plan.numerator_on_bins @ self.batch.fit.numerator / self._denominator)
 
     @cached_property
-    def _output(self) -> ComplexArray:
-        """(M, K)."""
+    def _output(self) -> tuple[ComplexArray, BoolArray]:
+        """(M, K), and on which bins (K,) the input is part of it."""
         plan, basis = self.plan, self.plan.transient_on_bins
         decay = self.batch.fit.transient.reshape(-1, basis.shape[1])  # (M, c)
         transient = decay @ basis.T / self._denominator
@@ -124,17 +124,17 @@ class _Fitted:
         error, through = self.y - transient, self.g * self.u
         less = np.linalg.norm((error - through)[:, plan.others_at])
         follows = plan.driven | bool(less < np.linalg.norm(error[:, plan.others_at]))
-        return np.asarray(np.where(follows, through, 0) + transient)
+        return np.where(follows, through, 0) + transient, follows
 
     @cached_property
     def variance(self) -> FloatArray:
         """(K,) of the output less that of the model."""
         variance_y, variance_u = self.batch.noise_variance
-        return np.asarray(variance_y + np.where(self.plan.driven, variance_u * np.abs(self.g) ** 2, 0))
+        return np.asarray(variance_y + np.where(self._output[1], variance_u * np.abs(self.g) ** 2, 0))
 
     def errors(self) -> ComplexArray:
         """(M, K) output less that of the model."""
-        return np.asarray(self.y - self._output)
+        return np.asarray(self.y - self._output[0])
 
     def without_each(self) -> FloatArray:
         """(K,) mean over records of what the cost falls by without a bin, in units of its variance.
@@ -146,7 +146,7 @@ class _Fitted:
         u = np.where(plan.driven, self.u, 0)
         bases = (plan.denominator_basis.values, plan.numerator_on_bins, plan.transient_on_bins)
         scale, error = weight / self._denominator, self.errors() * weight
-        return np.asarray(falls_without_each(bases, self._output, u, scale, error).mean(axis=0))
+        return np.asarray(falls_without_each(bases, self._output[0], u, scale, error).mean(axis=0))
 
 
 def poles_without_tones(

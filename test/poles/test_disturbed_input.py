@@ -137,6 +137,17 @@ def test_a_disturbed_record_changes_the_noise_of_no_other_one_of_a_batch():
     assert weighted.variance[:100] == pytest.approx(alone.variance)
 
 
+@pytest.mark.parametrize("periods", [2, 3])
+def test_noise_of_the_voltmeter_is_largest_at_a_mode_that_a_disturbance_moves(monkeypatch, periods):
+    """With means over pieces of the band half of the ellipses held the mode, and noise was named a tone."""
+    monkeypatch.setattr(f"{__name__}.DAMPING_RATIO", 0.005)
+    noise = {"generator": 0.1, "voltmeter_u": 0.03, "noise_y": 4e-3, "periods": periods}
+    found = [identify(*record(seed, kind="white", **noise)) for seed in range(60)]
+    assert sum("tone" in p.message for p in found) <= 3
+    inside = sum(distance(p) < stats.chi2.ppf(0.95, 2) for p in found)
+    assert stats.binom.cdf(inside, 60, 0.95) > 1e-3
+
+
 @pytest.mark.parametrize("kind", ["white", "narrow"])
 def test_noise_of_the_voltmeter_alone_is_no_excitation(kind):
     for seed in range(4):
