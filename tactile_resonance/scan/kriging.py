@@ -39,7 +39,7 @@ _BLOCK = 40
 MOST_JOINT = 1000
 _NEIGHBOURS, _ALONG = 300, 12  # of a tile; tiles along the longer side
 MIXED_POINTS = 40
-"""Up to so many points the uncertainty of length, size and scatter counts: of more it adds little."""
+"""Up to so many places the uncertainty of length, size and scatter counts: of more it adds little."""
 # Of the mixture: steps of the logarithms of length and size; sizes in standard deviations of theirs; least
 # share of the largest; scatters over that of the values.
 _LENGTH_STEP, _SIZE_STEP, _SIZE_STEPS, _LEAST_SHARE = 0.7, 0.25, (-1.3, 0, 1.3, 2.6), 0.1
@@ -154,7 +154,7 @@ class KrigedSurface:
         """(...) value and its standard deviation at (..., 2) positions.
 
         The standard deviation is that of the quantity at the place, with its scatter, not of a new measurement
-        of it; it includes that of the mean and, of up to `MIXED_POINTS` points, of length, size and scatter.
+        of it; it includes that of the mean and, of up to `MIXED_POINTS` places, of length, size and scatter.
         Beyond `MOST_JOINT` points both, and the mean, are those of the neighbours of tiles of the places.
         """
         at = np.asarray(xy_m, float)
@@ -218,7 +218,7 @@ def krige(
     scale, longest = _scale(y), min(10 * extent, most_length_m)
     lowest, highest = np.log(min(0.3 * nearest, longest)), np.log(longest)
     sizes = np.log(max(1e-4 * scale, least_std)), np.log(max(100 * scale, least_std))
-    if len(y) <= MIXED_POINTS:
+    if len(places) <= MIXED_POINTS and len(y) <= FIT_POINTS:
         lengths = lowest, max(lowest, min(highest, np.log(3 * extent)))
         constants, shares = _spread(lengths, sizes, xy, y, noise)
     else:
