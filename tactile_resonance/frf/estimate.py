@@ -255,9 +255,9 @@ def _contradiction(
     if where is not None:
         ends_hz = frequency_hz[where][[0, -1]]
         return (
-            f"a transient at {ends_hz[0]:g} to {ends_hz[1]:g} Hz, or a drift, or a tone between lines: what "
-            "the realisations differ by is alike on neighbouring lines, which noise and distortion are not; "
-            "record two periods or more of each, or wait before the record"
+            f"a transient at {ends_hz[0]:g} to {ends_hz[1]:g} Hz, a drift, jump or knock, or a tone between "
+            "lines: what the realisations differ by is alike on neighbouring lines, which noise and distortion "
+            "are not; record two periods or more of each, or wait before the record"
         )
     g_each, u = (x.reshape(-1, *g_each.shape[-2:]) for x in (g_each, each[..., 1, :]))
     return next(filter(None, disagreement(g_each, u, differ)[0]), "")

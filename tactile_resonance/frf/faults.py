@@ -309,7 +309,8 @@ def hum(x: _Channel) -> Fault | None:
     rms = float(np.sqrt(power[np.unique(at[of])].sum()))
     names = ", ".join(f"{tone:g}" for tone in found)
     text = f"Mains hum in the {x.name} at {names} Hz, at least {rms:.2g} V rms"
-    if spoils := bool(near[of].any()):
+    spoils = bool(near[of].any())
+    if spoils and len(found) == 1:
         text += ", or a mode that rings on there"
     return x.fault(FaultKind.HUM, rms, spoils, text)
 

@@ -359,7 +359,7 @@ def poles_with_drift(
             elif modes.left_out(drift) > MOST_LEFT_OUT:
                 poles = _changed(poles, TOO_NARROW)
             return poles, float(modes.fit.noise_variance[0])
-    reason = "the mode changes over the record, and no fit with its drift is found"
+    reason = "the mode changes over the record, or is disturbed in it, and no fit with a drift is found"
     return _changed(single(fit), reason), float(fit.noise_variance[0])
 
 

@@ -272,6 +272,7 @@ def test_hum(record, mains, near):
     fault = only(check(u, y + 0.01 * np.sin(2 * np.pi * mains * t)), FaultKind.HUM, "sensor")
     assert f"{round(mains)} Hz" in fault.message
     assert fault.spoils is near
+    assert ("or a mode that rings" in fault.text) is near
 
 
 @pytest.mark.parametrize("periods", [2, 3, 5])
@@ -324,6 +325,7 @@ def test_hum_of_the_silverbox(shared_data):
     )
     assert FaultKind.HUM in kinds(report)
     assert "150" in report.message
+    assert "or a mode" not in report.message  # which is at one place
 
 
 @pytest.mark.parametrize("seed", range(4))

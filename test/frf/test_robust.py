@@ -166,6 +166,9 @@ def test_single_periods_from_rest_are_told_from_settled_ones():
     assert re.match("a transient at [0-9]+ to [0-9]+ Hz", from_rest.message)
     assert settled.status is FrfStatus.OK
     assert "transient" not in settled.message
+    y[0, 1, 0, :300] += 30 * impulse[:300]  # as a knock leaves it
+    knocked = frf_of_record(Spectrum.of(u, y[:, 1]), sample_rate_hz=float(n), harmonics=lines)
+    assert "knock" in knocked.message
 
 
 @pytest.mark.parametrize("false_alarm", [estimate.FALSE_ALARM, 0.02])
