@@ -133,7 +133,7 @@ def start_channel(loopback: Sequence[CalibrationRecord]) -> tuple[float, float]:
 def start_in_air(
     record: CalibrationRecord, gain: float, delay: float, modes: int | None
 ) -> SensorModel:
-    """Peaks of ``1 / (1 - G)``, each with a local fit of one resonance on a straight line."""
+    """Peaks of ``1 / (1 - G)``, each as high and as wide as one resonance."""
     s = record.s_rad_s
     g = record.frf.g * np.exp(s * delay) / gain
     sharp = 1 / (1 - g)
@@ -158,40 +158,16 @@ def _peaks(
     """(n,) natural frequencies [rad/s], damping ratios and strengths of resonances in a response."""
     # a peak of chi^2 / (2 zeta w): chi goes as beta, w as beta^2, so that all peaks are about as high
     size = -h.imag * np.abs(s)
-    found, traits = signal.find_peaks(size, prominence=PEAK_HEIGHT * size.max())
+    found, traits = signal.find_peaks(size, prominence=PEAK_HEIGHT * size.max(), width=0)
+    ends = np.interp([traits["left_ips"], traits["right_ips"]], np.arange(s.size), np.abs(s))
     if modes is not None:
-        found = np.sort(found[np.argsort(-traits["prominences"])[:modes]])
+        kept = np.sort(np.argsort(-traits["prominences"])[:modes])
+        found, ends = found[kept], ends[:, kept]
         require(found.size == modes, "modes", modes, f"{found.size}, as many as {name} shows")
     require(found.size > 0, name, 0, "a response with a mode")
-    natural, damping, strength = np.array([_local_fit(s, h, at) for at in found]).T
-    return natural, damping, strength
-
-
-def _local_fit(s: ComplexArray, h: ComplexArray, at: int) -> tuple[float, float, float]:
-    """Natural frequency, damping ratio and strength of the resonance at a line.
-
-    ``h (s^2 + a s + b) = r + (c + d s)(s^2 + a s + b)`` is linear in a, b and what is multiplied out.
-    """
-    w = abs(s[at])
-    low, high = at - 3, at + 4
-    while high < s.size and abs(s[high]) < 1.03 * w:
-        high += 1
-    while low > 0 and abs(s[low]) > 0.97 * w:
-        low -= 1
-    part = slice(max(low, 0), high)
-    z, y = s[part] / w, h[part]
-    columns = np.stack([z * y, y, -np.ones_like(z), -z, -(z**2), -(z**3)], axis=1)
-    weight = 1 / np.abs(z**2 + 0.02 * z + 1)
-    rows, right = columns * weight[:, None], -(z**2) * y * weight
-    real = np.concatenate([rows.real, rows.imag]), np.concatenate([right.real, right.imag])
-    a, b, *line = np.linalg.lstsq(*real, rcond=None)[0]
-    natural = np.sqrt(b) if 0.9 < b < 1.1 else 1.0
-    zeta = a / 2 / natural if 1e-4 < a / 2 < 0.3 else 0.01
-    pole = natural * (-zeta + 1j * np.sqrt(1 - zeta**2))
-    strength = np.polyval(line[::-1], pole).real
-    if not strength > 0:
-        strength = -2 * zeta * h[at].imag
-    return float(natural * w), float(zeta), float(strength * w**2)
+    natural = ends.mean(axis=0)
+    damping = (ends[1] - ends[0]) / 2 / natural  # at half of the height
+    return natural, damping, -2 * damping * natural**2 * h[found].imag
 
 
 def one_above(sensor: SensorModel, top_hz: float) -> SensorModel:
