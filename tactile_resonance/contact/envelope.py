@@ -16,7 +16,7 @@ from typing import NamedTuple
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.contact.vectors import ZERO, Six, Vector, dot
+from tactile_resonance.contact.vectors import ZERO, Six, Vector, dot, turn_from_vector
 
 RATE_WINDOW_NS = 10_000_000
 RECENT, LONGEST_GAP_NS = 64, 200_000_000
@@ -228,12 +228,7 @@ class Envelope:
             x, y, z = arm.position_m
             text = f"tip at {x:.4f}, {y:.4f}, {z:.4f} m, workspace {box.low_m} to {box.high_m} m"
             return Breach(Cause.WORKSPACE, text)
-        # +z of the tip against the vertical: Rodrigues' formula for the one element needed
-        rx, ry, rz = arm.rotation_rad
-        angle = math.hypot(rx, ry, rz)
-        share = (rz / angle) ** 2 if angle > 0 else 1.0
-        cosine = math.cos(angle)
-        upright = cosine + (1 - cosine) * share
+        upright = turn_from_vector(arm.rotation_rad)[8]  # +z of the tip against the vertical
         if upright < self._least_upright:
             tilt = math.acos(max(-1.0, upright))
             return Breach(

@@ -78,7 +78,7 @@ class Zero:
 def tare(
     samples: Sequence[WrenchSample], parameters: ContactParameters, time_ns: int
 ) -> tuple[Zero, float]:
-    """Zero from samples without contact, refused beyond the limits that the parameters state for each axis.
+    """Zero from sound samples in air, refused beyond the limits that the parameters state for each axis.
 
     The standard deviation of the mean takes the correlation of neighbouring samples into account: a filter
     in the sensor makes it no smaller than it is.
@@ -93,20 +93,12 @@ def tare(
     Raises
     ------
     TareError
-        Too few samples or an overload; noise, drift or offset beyond the limits, with the figures.
+        Too few samples; noise, drift or offset beyond the limits, with the figures.
     """
     if len(samples) < FEWEST:
         raise TareError(f"tare: {len(samples)} samples, expected at least {FEWEST}")
-    if any(sample.overload for sample in samples):
-        raise TareError("tare: the sensor is overloaded")
     force = np.array([sample.force_n for sample in samples])  # (n, 3)
-    if not np.all(np.isfinite(force)):
-        raise TareError("tare: a sample is not finite")
-    stamps = np.array([sample.time_ns for sample in samples], dtype=np.int64)
-    middle_ns = int(stamps[0]) + int(stamps[-1] - stamps[0]) // 2
-    t = (stamps - middle_ns) * 1e-9
-    if not np.any(t > t[0]):
-        raise TareError("tare: all samples have one time stamp")
+    t = np.array([sample.time_ns - samples[0].time_ns for sample in samples]) * 1e-9
     n = len(t)
     t = t - t.mean()
     mean = force.mean(axis=0)
