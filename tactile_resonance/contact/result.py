@@ -155,7 +155,12 @@ class Outcome:
         if self._result is None:
             return None
         # after a contact is given up the force still rises until the tip has turned round
-        result = replace(self._result, peak_force_n=self._observer.watch.peak_n)
+        peak_n, hard_n = self._observer.watch.peak_n, self._observer.limits.hard_force_n
+        result = replace(self._result, peak_force_n=peak_n)
+        if peak_n > hard_n and result.cause in (Cause.FORCE_ABORT, Cause.FORCE_RATE):
+            text = f"{1e3 * peak_n:.1f} mN on the tip, beyond the hard limit of {1e3 * hard_n:g} mN"
+            text = f"{text}; before: {result.message}"
+            result = replace(result, cause=Cause.FORCE_HARD, message=text)
         mean = self._observer.mean_force() if holding else None
         return result if mean is None else replace(result, force_n=mean[0], force_std_n=mean[1])
 
