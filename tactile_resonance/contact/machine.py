@@ -383,7 +383,8 @@ class ContactController:
             return None
         if self.state is State.HOLD:
             return Breach(Cause.HOLD_ENDED, f"held for {most_s:g} s, as long as is allowed")
-        return Breach(Cause.TIME, f"{self.state.value} took longer than {most_s:g} s")
+        name = "pressing" if self.state in TOUCHING else self.state.value
+        return Breach(Cause.TIME, f"{name} took longer than {most_s:g} s")
 
     def _heed_wish(self, now_ns: int, breach: Breach | None) -> None:
         """Draw back as asked for; a wish that the arm cannot follow soon is forgotten."""
@@ -461,7 +462,9 @@ class ContactController:
             self._withdrawal.begin(cause, self._pressed_n)
             if self.state is not State.HOLD:
                 self._free.rest_m = self._usual_m
-        self.state, self._state_ns = state, now_ns
+        self.state = state
+        if state is not State.SETTLE:  # part of pressing, whose time is limited from the touch on
+            self._state_ns = now_ns
         if state in (State.TRAVEL, State.RETRACT, State.IDLE):
             self._wish_retract, self._wish_ns = False, None
 

@@ -23,6 +23,7 @@ from tactile_resonance.contact.result import Cause, NotIdleError
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.plant.contact_bench import DISH_KG
+from tactile_resonance.simulation.plant.surfaces import FlatSurface
 from tactile_resonance.simulation.ur5e.machine import TrackingParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -409,3 +410,25 @@ def test_touch_told_by_the_resonance_slows_the_rest_of_the_approach():
     made.loop.run_while(lambda: made.controller.result is None)
     assert made.controller.result.reached
     assert made.controller.result.told_m == pytest.approx(told_m, abs=2e-5)
+
+
+def test_pressing_is_limited_from_the_touch_on_however_it_is_divided():
+    shaken = contact(
+        height_m=5e-4,
+        parameters=replace(QUICK, tolerance=0.01, settle_s=2.0),
+        limits=Limits(press_s=1.0),
+        seed=1,
+    )
+    bench, since_s = shaken.bench, {}
+
+    def shake():
+        t_s = bench.clock.time_ns * 1e-9
+        since_s.setdefault(shaken.controller.state, t_s)
+        height_m = 5e-4 + 1e-4 * min(1.0, max(0.0, t_s - 0.5)) * np.sin(6 * np.pi * t_s)
+        bench.plant.surface = FlatSurface.tilted(height_m, 0.0)
+
+    bench.clock.on_step.append(shake)
+    result = shaken.loop.make(shaken.goal)
+    assert result.cause is Cause.TIME
+    assert State.SETTLE in since_s
+    assert bench.clock.time_ns * 1e-9 - since_s[State.CONTACT] == pytest.approx(1.0, abs=0.01)
