@@ -217,23 +217,28 @@ def with_noise(
     response = (beta[:, 0] @ plan.numerator_on_bins[plan.others_at].T / of_a).repeat(records, axis=1)
     power_error, power_u, cross, correlated = _powers(error, u)
     by_g, gain = response * u, cross / np.maximum(power_u, TINY)
-    rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
     # over a mode the phase of the response turns; its size would let the few bins of a peak decide
     seen = correlated | _powers(error, by_g / np.maximum(np.abs(response), TINY))[3]
-    generator = seen & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
-    common = correlated & ~generator
-    through = np.where(generator, by_g, np.where(common, gain * u, 0.0))
-    rest, size = error - through, error.shape[1]
+    generator = common = seen
+    rest, size = error, error.shape[1]
+    if seen.any():
+        rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
+        generator = seen & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
+        common = correlated & ~generator
+        through = np.where(generator, by_g, np.where(common, gain * u, 0.0))
+        rest = error - through
     free = size / max(size - problem.sizes[2] * records / 2, 1.0)  # of what the transients have left
     pieces = _pieces_between(data.undriven, records)
-    total_power, _ = _by_piece(error, pieces, free)
     rest_power, kind = _by_piece(rest, pieces, free)
     input_power, kind_u = _by_piece(u, pieces, 1.0)
+    measured = rest_power
+    if common.any():
+        measured = np.where(common, _by_piece(error, pieces, free)[0], rest_power)
     variance_u = np.where(generator, 0.0, input_power)
     beside = np.minimum(np.searchsorted(plan.others_at, plan.excited_at), data.undriven - 1)
     of_excited, rows = pieces.of_bin[beside], np.flatnonzero(generator)
     of_rest = _on(pieces.of_bin, rest_power)
-    of_y = _on(of_excited, np.where(common, total_power, rest_power))
+    of_y = _on(of_excited, measured)
     mean = np.concatenate([_mean_power(rest) * free, variance_u.mean(-1, keepdims=True)], -1)
     kind = np.maximum(kind, np.where(generator[:, 0], 0, kind_u))
     if rows.size:  # an input that is known but for the noise of its voltmeter, which the response brings in
@@ -286,7 +291,7 @@ def _powers(
 ) -> tuple[FloatArray, FloatArray, ComplexArray, BoolArray]:
     """(batch, 1) mean powers of errors and inputs, of their product, and whether they are correlated."""
     power_error, power_u = _mean_power(error), _mean_power(u)
-    cross = np.mean(error * u.conj(), axis=-1, keepdims=True)
+    cross = _mean_product(u, error)
     squared = np.abs(cross) ** 2 / np.maximum(power_error * power_u, TINY)
     return power_error, power_u, cross, np.asarray(squared > _correlation_limit(error.shape[1]))
 
@@ -307,4 +312,9 @@ def _power(values: ComplexArray) -> FloatArray:
 
 def _mean_power(values: ComplexArray) -> FloatArray:
     """(batch, 1)."""
-    return np.asarray(np.mean(_power(values), axis=-1, keepdims=True))
+    return _mean_product(values, values).real
+
+
+def _mean_product(x: ComplexArray, y: ComplexArray) -> ComplexArray:
+    """(batch, 1) mean of x* y."""
+    return np.asarray((x.conj()[:, None] @ y[..., None])[..., 0] / x.shape[-1])

@@ -204,7 +204,7 @@ class Problem:
     numerator: ComplexArray
     transient: ComplexArray
 
-    @property
+    @cached_property
     def sizes(self) -> tuple[int, int, int]:
         """Numbers of free coefficients of A, B and C."""
         a, b, c = (x.shape[1] for x in (self.denominator, self.numerator, self.transient))
