@@ -291,10 +291,10 @@ class MeasuredContact:
         """Contact from one ROS time to another [ns]; with a reason where the force is unknown."""
         deadline = time.monotonic() + min(self._within_s, DISCOVERED_WITHIN_S)
         # rclpy's own wait looks four times a second
-        while not self._client.service_is_ready() and time.monotonic() < deadline:
+        while not self._client.service_is_ready():
+            if time.monotonic() >= deadline:
+                return Contact(reason=f"no node serves {self._client.srv_name}")
             time.sleep(POLL_S)
-        if not self._client.service_is_ready():
-            return Contact(reason=f"no node serves {self._client.srv_name}")
         request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))
         answered = threading.Event()
         future = self._client.call_async(request)

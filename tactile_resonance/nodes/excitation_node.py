@@ -388,7 +388,7 @@ def check_output(excitations: Sequence[Excitation], info: DeviceInfo) -> None:
 def main() -> None:
     """Console script."""
     # the thread that reads the device takes over from that of the executor within this, and not 5 ms
-    sys.setswitchinterval(1e-4)
+    sys.setswitchinterval(1e-5)
     ExcitationNode.run()
 
 
