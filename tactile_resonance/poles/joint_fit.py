@@ -9,7 +9,7 @@ record the cost and the smoothness of the residuals show that, and a search for 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
 
-# How often the noise of one record is taken anew, and the change of its variance below which it is the same.
+# How often the noise is taken anew, and the part by which its variance must turn out smaller for that.
 MOST_RETURNS = 4
 SAME_LEVEL = 0.1
 # The scatter of realisations and the noise are taken anew from a fit that they weigh.
@@ -116,6 +116,17 @@ class _Round:
             y, u = self.plain.y[k], self.plain.u[k]
             lines[k] *= bool(np.isfinite(y).all() and np.isfinite(u).all())
         return lines
+
+    @property
+    def anew(self) -> _Round:
+        """Weighted with the noise that the fit shows."""
+        return self.weighted_with_noise(self.plan, self.plain, self.solution.theta)
+
+    @property
+    def level(self) -> FloatArray:
+        """(batch,) of the noise between harmonics, in units of that weighted with; NaN without such bins."""
+        bins, (used, _) = self.data.records * self.data.undriven, self.solution.leverage.T
+        return np.asarray(self.solution.part_cost[:, 0] / (bins - used / 2))
 
     @cached_property
     def response(self) -> ComplexArray:
@@ -220,27 +231,23 @@ def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
     plan : JointPlan
     u, y : (batch, M, K) complex
         At its bins, of M records each.
-
-    Notes
-    -----
-    Of one record: one step from start values the residuals are all but noise, unless the input's noise is
-    far above the output's or the same in both. Where the noise then looks other than flat, or the model
-    wrong, its level is taken once more, from where the fit ended.
     """
-    u = _without_rounding(plan, u)
-    judged = _fit(plan, u, y)
-    doubtful = np.full(len(y), _returns(plan, y.shape[1]))
-    for _ in range(MOST_RETURNS):
-        doubtful &= judged.suspect | (judged.kind != 0)
-        if doubtful.any():
-            doubtful &= _may_return(judged)
-        rows = np.flatnonzero(doubtful)
-        if not rows.size:
-            break
-        before = judged.noise_variance[rows, 0]
-        judged.put(rows, _fit(plan, u[rows], y[rows], judged.theta[rows, None]))
-        doubtful[rows] &= np.abs(judged.noise_variance[rows, 0] - before) > SAME_LEVEL * before
-    return judged
+    plain = BinData.of(y, _without_rounding(plan, u), plan.order, plan.others_at.size)
+    if plain.undriven == 0:
+        ratio = plan.input_noise_ratio or 0.0
+        data = plain.weighted(variance_u=np.full((len(y), 1), ratio)) if ratio else plain
+        solution = minimise(plan.problem, data)
+        noise = np.tile([1.0, ratio], (len(y), 1))
+    else:
+        rules = rules_between(plain.undriven, plain.records)
+        solution = minimise(plan.problem, plain, None, rules)
+        noise = solution.noise
+        variance_y = np.where(noise[:, :1] > TINY, noise[:, :1], 1.0)
+        data = plain.weighted(rest=variance_y, variance_y=variance_y, variance_u=noise[:, 1:])
+    refit_failed(plan.problem, solution, data)
+    if plan.structure.order >= SEVERAL_MODES:
+        solution = best_of_split(plan, data, solution)
+    return _worth(_Round(plan, plain, data, solution, noise, np.zeros(len(y), np.int64)))
 
 
 def _without_rounding(plan: JointPlan, u: ComplexArray) -> ComplexArray:
@@ -265,50 +272,35 @@ def _without_rounding(plan: JointPlan, u: ComplexArray) -> ComplexArray:
     return u
 
 
-def _returns(plan: JointPlan, records: int) -> bool:
-    """Whether fits from start values are taken once more where they are in doubt."""
-    return records == 1 and plan.others_at.size > 0
+def _worth(fitted: _Round, returns: int = MOST_RETURNS, changed: BoolArray | bool = True) -> Judged:
+    """What a fit is worth; the noise is taken anew from it first where start values showed it badly.
 
-
-def _fit(
-    plan: JointPlan, u: ComplexArray, y: ComplexArray, start: FloatArray | None = None
-) -> Judged:
-    """Fits of points, from coefficients (batch, M, n) near them or from start values."""
-    plain = BinData.of(y, u, plan.order, plan.others_at.size)
-    if start is not None:
-        return _alone(_Round.weighted_with_noise(plan, plain, start), last=True)
-    if plain.undriven == 0:
-        ratio = plan.input_noise_ratio or 0.0
-        data = plain.weighted(variance_u=np.full((len(y), 1), ratio)) if ratio else plain
-        solution = minimise(plan.problem, data)
-        noise = np.tile([1.0, ratio], (len(y), 1))
-    else:
-        rules = rules_between(plain.undriven, plain.records)
-        solution = minimise(plan.problem, plain, None, rules)
-        noise = solution.noise
-        variance_y = np.where(noise[:, :1] > TINY, noise[:, :1], 1.0)
-        data = plain.weighted(rest=variance_y, variance_y=variance_y, variance_u=noise[:, 1:])
-    refit_failed(plan.problem, solution, data)
-    if plan.structure.order >= SEVERAL_MODES:
-        solution = best_of_split(plan, data, solution)
-    last = not _returns(plan, plain.records)
-    judge = _several if plain.records > 1 else partial(_alone, last=last)
-    judged = judge(_Round(plan, plain, data, solution, noise, np.zeros(len(y), np.int64)))
-    others = np.flatnonzero(~solution.plain)
-    if others.size:
-        theta = solution.theta[others]
-        judged.put(others, judge(_Round.weighted_with_noise(plan, plain.rows(others), theta)))
+    That is where it turns out smaller or, of one record, is not flat and has `changed` (batch,). Up to so many
+    times.
+    """
+    judge, solution = _alone if fitted.plain.records == 1 else _several, fitted.solution
+    badly = (fitted.level < 1 - SAME_LEVEL) | ((fitted.kind > 0) & changed & (judge is _alone))
+    rows = np.flatnonzero((badly & _may_return(solution)) | ~solution.plain)
+    if not (rows.size and returns):
+        return judge(fitted)
+    changed = (np.abs(fitted.level - 1) > SAME_LEVEL) | ~solution.plain
+    anew = _worth(fitted.rows(rows).anew, returns - 1, changed[rows])
+    if rows.size == badly.size:
+        return anew
+    solution.plain[rows] = solution.converged[rows] = False  # nothing more is asked of these
+    judged = judge(fitted)
+    judged.put(rows, anew)
     return judged
 
 
-def _may_return(fit: Judged | Solution) -> BoolArray:
+def _may_return(fit: Solution) -> BoolArray:
     """(batch,) whether a fit ended where another one may begin."""
     finite = np.isfinite(fit.theta).all(axis=tuple(range(1, fit.theta.ndim)))
     return np.asarray(fit.converged & finite)
 
 
-def _alone(fitted: _Round, last: bool) -> Judged:
-    """What a fit of one record is worth; compared with other fits where wrong, and the `last` one."""
+def _alone(fitted: _Round) -> Judged:
+    """What a fit of one record is worth."""
     plan = fitted.plan
     solution, data = fitted.solution, fitted.data
     theta, inverse = solution.theta[:, 0], solution.marginal[:, 0]
@@ -331,8 +323,7 @@ def _alone(fitted: _Round, last: bool) -> Judged:
         suspect &= doubted
         lack.found[~suspect] = np.nan
     lack = lack.only_where(doubted & ~suspect)
-    # others are fitted once more
-    wrong = (suspect if last else suspect & ~_may_return(solution)) & solution.plain
+    wrong = suspect & solution.plain
     # real and imaginary part of a circular complex error have half its variance each
     covariance = inverse * (0.5 * scale * correction * fitted.at_modes(scale))[:, None, None]
     known = plan.level_known
@@ -387,28 +378,14 @@ def noise_of_moving_modes(
     return float(noise_at_modes(plan, fitted.data, fitted.solution, scale)[0])
 
 
-def _several(first: _Round, returns: int = MOST_RETURNS) -> Judged:
-    """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own.
-
-    Where start values hid how small the noise on Y is, that on U would look like distortion: it is taken anew
-    first, up to so many times.
-    """
-    plain, of_u = first.solution.plain, first.noise[:, 1] > 0
-    overrated = plain & of_u & (first.levels.between < 1 - SAME_LEVEL) & (returns > 0)
-
-    def anew(part: _Round) -> Judged:
-        return _several(_Round.weighted_with_noise(part.plan, part.plain, part.solution.theta), returns - 1)
-
-    parts = []
-    for which, judge in ((overrated, anew), (plain & ~overrated & _weighted_wrongly(first), _with_scatter)):
-        rows = np.flatnonzero(which)
-        if rows.size:
-            parts.append((rows, judge(first.rows(rows))))
-            if rows.size == plain.size:
-                return parts[0][1]
+def _several(first: _Round) -> Judged:
+    """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own."""
+    rows = np.flatnonzero(first.solution.plain & _weighted_wrongly(first))
+    if rows.size == first.kind.size:
+        return _with_scatter(first)
     judged = _judged(first, first)
-    for rows, part in parts:
-        judged.put(rows, part)
+    if rows.size:
+        judged.put(rows, _with_scatter(first.rows(rows)))
     return judged
 
 
