@@ -245,10 +245,6 @@ def nonlinear_distortion(
         Odd harmonics, part of `spectra.harmonics`.
     sample_rate_hz : float
 
-    Returns
-    -------
-    Distortion
-
     Raises
     ------
     ValueError

@@ -129,10 +129,6 @@ def find_faults(
     harmonics : (F,) int
         Excited lines.
 
-    Returns
-    -------
-    FaultReport
-
     Notes
     -----
     What is looked for, per record: `CHECKS`. A channel skew needs a loop-back measurement
@@ -409,10 +405,8 @@ def _few_lost(x: _Channel) -> Fault | None:
         return None
     place = edges[high[0]] + samples if high[0] else edges[high[-1]]
     seconds = (place + (start + 1 / 16) * samples) / x.sample_rate_hz
-    what = "lost" if lost > 0 else "doubled"
-    text = f"The {x.name} shifts by {abs(lost)} samples at about {seconds:.3g} s: some were {what} there"
-    if x.name == "sensor":
-        text += ", or it was disturbed"
+    text = f"The {x.name} shifts by {abs(lost)} samples at about {seconds:.3g} s: some were "
+    text += ("lost" if lost > 0 else "doubled") + (", or it was disturbed" if start else "") + " there"
     return x.fault(FaultKind.LOST_SAMPLES, abs(lost), True, text)
 
 

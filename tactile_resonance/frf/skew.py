@@ -83,18 +83,13 @@ def skew_from_loopback(
 
 
 def correct_skew(frf: FRF, delay_s: float) -> FRF:
-    """The FRF as it were without the delay of the sensor channel.
+    """The FRF as it were without the delay of the sensor channel; variances are the same.
 
     Parameters
     ----------
     frf : FRF
     delay_s : float
         Delay of the sensor channel behind the actuator channel [s], e.g. `ChannelSkew.delay_s`.
-
-    Returns
-    -------
-    FRF
-        Variances are the same.
     """
     if not np.isfinite(delay_s):
         raise ValueError(f"delay_s: {delay_s}, expected a finite delay in seconds")
