@@ -22,14 +22,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from operator import itemgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
-from tactile_resonance.contact.vectors import Vector, vector
+from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, vector
 from tactile_resonance.fields import require
+
+if TYPE_CHECKING:
+    from tactile_resonance.record import Contact
 
 SHORT_S = 0.02
 """Of the short means [s]."""
@@ -141,41 +145,6 @@ SPARE = 1.1
 """A source may be faster than it states by this factor without losing the oldest wrenches."""
 
 
-@dataclass(frozen=True)
-class ForceOver:
-    """Force and pose over an interval; NaN where not known.
-
-    Attributes
-    ----------
-    force_n : float
-        Time-weighted mean of the force along the normal [N].
-    force_std_n : float
-        Standard deviation of that mean [N]: that of the zero, and from the means of eight batches, so that
-        correlated noise and a slow decay count as they should (method of batch means; Law, *Simulation
-        Modeling and Analysis*, section 9.5.3). Noise that is alike over a batch or longer passes for motion of
-        the force, which is no error of its mean. NaN for fewer than 32 wrenches, and where all are equal: how
-        far they are off is then up to the step of the converter, which is not known here.
-    spread : ForceSpread
-        How the force moved meanwhile.
-    coverage : float
-        Share of the interval over which valid wrenches came without a gap.
-    position_m : tuple of 3 floats
-        Mean place of the tip in the base [m].
-    rotation_rad : tuple of 3 floats
-        Its rotation vector nearest to the middle of the interval [rad].
-    reason : str
-        Why `force_n` is NaN; empty where it is not.
-    """
-
-    force_n: float
-    force_std_n: float
-    spread: ForceSpread
-    coverage: float
-    position_m: Vector
-    rotation_rad: Vector
-    reason: str
-
-
 class ForceRecord:
     """Forces and poses of the last seconds; one thread may add while another asks.
 
@@ -259,14 +228,26 @@ class ForceRecord:
         with self._came:
             return self._came.wait_for(lambda: self._now_ns >= time_ns, within_s)
 
-    def over(self, t0_ns: int, t1_ns: int) -> ForceOver:
+    def over(self, t0_ns: int, t1_ns: int) -> Contact:
         """Return what is known of the interval from `t0_ns` to `t1_ns`.
+
+        The force is its time-weighted mean, the place that of the tip, in the base; the orientation is that
+        nearest to the middle of the interval, whose time they have. The coverage is the share over which valid
+        wrenches came without a gap.
+
+        The deviation of the mean is that of the zero, and from the means of eight batches, so that correlated
+        noise and a slow decay count as they should (method of batch means; Law, *Simulation Modeling and
+        Analysis*, section 9.5.3). Noise that is alike over a batch or longer passes for motion of the force,
+        which is no error of its mean. NaN for fewer than 32 wrenches, and where all are equal: how far they are
+        off is then up to the step of the converter, which is not known here.
 
         Raises
         ------
         ValueError
             If it does not end after it begins.
         """
+        from tactile_resonance.record import Contact  # it needs the spread
+
         require(t0_ns < t1_ns, "t1_ns", t1_ns, f"above t0_ns = {t0_ns}")
         with self._lock:
             now_ns, zero_std_n = self._now_ns, self._zero_std_n
@@ -276,14 +257,14 @@ class ForceRecord:
         (times, rows), (pose_times, poses) = _columns(heard, 1), _columns(placed, 6)
         coverage, mean, batches_n = _averages(times, rows, t0_ns, t1_ns, self._force_gap_ns)
         known, place_m, _ = _averages(pose_times, poses[:, :3], t0_ns, t1_ns, POSE_GAP_NS)
-        position_m = rotation_rad = (math.nan, math.nan, math.nan)
+        place: dict[str, Any] = {"coverage": coverage, "time_ns": (t0_ns + t1_ns) // 2}
         if known >= LEAST_COVERAGE:
-            position_m = vector(place_m)
-            rotation_rad = vector(poses[np.abs(pose_times - (t0_ns + t1_ns) // 2).argmin(), 3:])
+            nearest = np.abs(pose_times - place["time_ns"]).argmin()
+            place["position_m"] = vector(place_m)
+            place["orientation_xyzw"] = quaternion_from_vector(vector(poses[nearest, 3:]))
         reason = self._missing(t0_ns, t1_ns, now_ns, oldest_ns, coverage)
         if reason:
-            nan = math.nan
-            return ForceOver(nan, nan, ForceSpread(), coverage, position_m, rotation_rad, reason)
+            return Contact(**place, reason=reason)
         inside = (times >= t0_ns) & (times <= t1_ns)
         std_n, spread = math.nan, ForceSpread()
         forces_n = rows[inside & np.isfinite(rows[:, 0]), 0]
@@ -292,7 +273,7 @@ class ForceRecord:
                 std_n = math.hypot(batches_n, zero_std_n)
             time_s = (times[inside] - t0_ns) * 1e-9
             spread = spread_of(time_s, rows[inside, 0], (t1_ns - t0_ns) * 1e-9)
-        return ForceOver(float(mean[0]), std_n, spread, coverage, position_m, rotation_rad, "")
+        return Contact(float(mean[0]), std_n, **place, spread=spread)
 
     def _missing(
         self, t0_ns: int, t1_ns: int, now_ns: int, oldest_ns: float, coverage: float

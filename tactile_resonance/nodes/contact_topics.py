@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.nodes.managed_node import ManagedNode, in_thread
 from tactile_resonance.nodes.messages import (
     contact_state,
+    pose_to_message,
     tip_pose,
     wrench_message,
     write_force_over,
@@ -224,11 +226,8 @@ class ForceService:
         reason = "no contact was under way" if idle else over.reason
         write_force_over(response, reason, over.force_n, over.force_std_n, over.spread)
         response.coverage = over.coverage
-        if not math.isnan(over.position_m[0]):
-            middle_ns = clock.ros_ns((start_ns + end_ns) // 2)
-            response.tip_pose = tip_pose(
-                middle_ns, self._base_frame, over.position_m, over.rotation_rad
-            )
+        time_ns = clock.ros_ns(over.time_ns)
+        response.tip_pose = pose_to_message(replace(over, time_ns=time_ns, frame_id=self._base_frame))
         return response
 
 
