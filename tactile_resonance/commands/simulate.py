@@ -30,8 +30,8 @@ from tactile_resonance.simulation.plant.defaults import CAN_PORT, READY, TABLE_I
 from tactile_resonance.simulation.ur5e.reactor import Reactor
 
 if TYPE_CHECKING:
+    from tactile_resonance.simulation.plant.plant import Plant
     from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
-    from tactile_resonance.simulation.plant.tabletop import Tabletop
 
 BUSES: dict[str, Callable[[Reactor, int, Receiver], TcpBus]] = {
     "socketcand": SocketcandServer,
@@ -100,10 +100,10 @@ def _simulate_ur(options: argparse.Namespace) -> int:
     from tactile_resonance.simulation.ur5e.machine import MachineConfig
 
     nothing = options.tissue is None and options.scene is None
-    tabletop = None if nothing else _tabletop(options)
+    plant = None if nothing else _plant(options)
     controller = UrController(
         MachineConfig(tip_in_flange=six(TIP_IN_FLANGE.vector)),
-        None if tabletop is None else tabletop.plant,
+        plant,
         seed=options.seed,
     )
     robot = SimulatedRobot(
@@ -114,8 +114,8 @@ def _simulate_ur(options: argparse.Namespace) -> int:
     )
     robot.time.seeds.append(lambda seed: controller.reseed((options.seed, *seed)))
     ready = f"{READY} {options.host}, control port {options.control_port}"
-    if tabletop is not None:
-        _attach(robot, tabletop, options)
+    if plant is not None:
+        _attach(robot, plant, options)
         ready += f"; {options.tissue or options.scene} under it, load cell: socketcand port {options.can_port}"
     _stop_when_asked(robot.time)
     if options.priority:
@@ -129,7 +129,7 @@ def _simulate_ur(options: argparse.Namespace) -> int:
     return 0
 
 
-def _tabletop(options: argparse.Namespace) -> Tabletop:
+def _plant(options: argparse.Namespace) -> Plant:
     """Tissue and load cell as the options want them."""
     import numpy as np
 
@@ -137,7 +137,7 @@ def _tabletop(options: argparse.Namespace) -> Tabletop:
     from tactile_resonance.contact.samples import Pose
     from tactile_resonance.sensor import read_sensor
     from tactile_resonance.simulation.plant.surfaces import LaidScene
-    from tactile_resonance.simulation.plant.tabletop import Tabletop, bench_surface
+    from tactile_resonance.simulation.plant.tabletop import bench_surface, table_plant
     from tactile_resonance.simulation.tissue.library import read_tissues
     from tactile_resonance.simulation.tissue.scene import read_scene
 
@@ -146,15 +146,18 @@ def _tabletop(options: argparse.Namespace) -> Tabletop:
     if options.scene is not None:
         table = Pose.from_vector(np.array(options.table))
         laid = LaidScene(read_scene(library, options.scene), table)
-        return Tabletop.of_scene(library, sensor, laid, **how)
+        # what is computed once must not hold up the first touch
+        laid.tissue_at(laid.table.position_m)
+        return table_plant(library, sensor, laid.surface(), laid.tissue_at, laid.scene.motion, **how)
     tissue = library[options.tissue]
     surface = bench_surface(options.surface_height, math.radians(options.tilt))
-    return Tabletop(library, sensor, surface, lambda _: tissue, **how)
+    return table_plant(library, sensor, surface, lambda _: tissue, **how)
 
 
-def _attach(robot: SimulatedRobot, tabletop: Tabletop, options: argparse.Namespace) -> None:
+def _attach(robot: SimulatedRobot, plant: Plant, options: argparse.Namespace) -> None:
     """Serve the cell's bus and take orders for tissue and cell at the robot's control port."""
     from tactile_resonance.simulation.plant.tabletop import attach, attach_cell
+    from tactile_resonance.simulation.tissue.library import read_tissues
 
     cell = LoadCell(CellParameters.from_yaml(options.cell), options.seed + 1)
     try:
@@ -162,8 +165,8 @@ def _attach(robot: SimulatedRobot, tabletop: Tabletop, options: argparse.Namespa
     except ValueError as error:
         raise ValueError(f"--can-port: {error}") from error
     robot.time.seeds.append(lambda seed: cell.reseed((options.seed + 1, *seed)))
-    attach(robot, tabletop)
-    attach_cell(robot, tabletop.plant, cell, bus)
+    attach(robot, plant, read_tissues())
+    attach_cell(robot, plant, cell, bus)
 
 
 def _check_ur(options: argparse.Namespace) -> None:

@@ -11,9 +11,10 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from itertools import takewhile
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,8 +29,8 @@ from tactile_resonance.simulation.cell.transducer import LoadCell
 from tactile_resonance.simulation.plant.defaults import MOST_STEPS
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
-from tactile_resonance.simulation.plant.surfaces import LaidScene, Surface, SurfaceMotion
-from tactile_resonance.simulation.plant.tip import Tip
+from tactile_resonance.simulation.plant.surfaces import Surface, SurfaceMotion
+from tactile_resonance.simulation.plant.tip import Tip, TipOnTissue
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import TissueLibrary
@@ -127,8 +128,17 @@ def bench_surface(height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0
     return Surface.tilted(height_m, tilt_rad, azimuth_rad)
 
 
-class Tabletop:
-    """The plant with what can be exchanged on it while it runs.
+def table_plant(
+    library: TissueLibrary,
+    sensor: SensorParameters,
+    surface: Surface,
+    tissue_at: Callable[[FloatArray], Tissue | None],
+    motion: SurfaceMotion | None = None,
+    *,
+    rigid_tip: bool = False,
+    mount: Mount = Mount.TABLE,
+) -> Plant:
+    """Return what the controller's tool touches, all of which can be exchanged while it runs.
 
     Parameters
     ----------
@@ -143,88 +153,60 @@ class Tabletop:
         The ball on the robot itself; else at the end of the sensor's beam.
     mount : Mount
         Of the cell.
-
-    Attributes
-    ----------
-    plant : Plant
-        What the controller's tool touches.
     """
+    beam, nu = None if rigid_tip else sensor_modes(sensor), library.contact.poisson_ratio
+    tip = Tip(sensor.tip.radius_m, beam, nu)
 
-    def __init__(
-        self,
-        library: TissueLibrary,
-        sensor: SensorParameters,
-        surface: Surface,
-        tissue_at: Callable[[FloatArray], Tissue | None],
-        motion: SurfaceMotion | None = None,
-        *,
-        rigid_tip: bool = False,
-        mount: Mount = Mount.TABLE,
-    ) -> None:
-        self._library = library
-        tip = Tip(
-            sensor.tip.radius_m,
-            None if rigid_tip else sensor_modes(sensor),
-            library.contact.poisson_ratio,
-        )
-        self.plant = Plant(
-            surface,
-            tissue_at,
-            lambda tissue: tip.on(tissue, surface),
-            tip_radius_m=tip.radius_m,
-            mount=mount,
-        )
-        self.plant.motion = motion
+    def on(tissue: Tissue) -> TipOnTissue:
+        return tip.on(tissue, surface)
 
-    @classmethod
-    def of_scene(
-        cls, library: TissueLibrary, sensor: SensorParameters, laid: LaidScene, **options: Any
-    ) -> Tabletop:
-        """Return the table with a scene on it; `options` are `rigid_tip` and `mount`."""
-        # what is computed once must not hold up the first touch
-        laid.tissue_at(laid.table.position_m)
-        return cls(library, sensor, laid.surface(), laid.tissue_at, laid.scene.motion, **options)
-
-    def place_surface(self, fields: dict) -> None:
-        """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
-        self.plant.surface = bench_surface(
-            number(fields.get("height_m"), "height_m"),
-            number(fields.get("tilt_rad", 0.0), "tilt_rad"),
-            number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
-        )
-
-    def move_surface(self, fields: dict) -> None:
-        """Control port: how the surface moves from now on; fields of `SurfaceMotion`, none: at rest."""
-        asked = {name: value for name, value in fields.items() if name != "command"}
-        self.plant.motion = read_dataclass(SurfaceMotion, asked, "") if asked else None
-
-    def place_tissue(self, fields: dict) -> None:
-        """Control port: what the tip finds at its next new place; field ``name``, null for nothing."""
-        name = fields.get("name")
-        tissue = None if name is None else self._library[str(name)]
-        self.plant.tissue_at = lambda _: tissue
-
-    def truth(self, _: dict) -> dict:
-        """Control port: the true state of the contact."""
-        names = (
-            *("time_s", "tip_m", "site_m", "force_n", "normal_force_n", "contact_s", "depth_m"),
-            *("contact_radius_m", "in_contact", "touches"),
-        )
-        tissue = self.plant.tissue
-        told = {name: getattr(self.plant, name) for name in names}
-        return told | {"tissue": None if tissue is None else tissue.name}
+    plant = Plant(surface, tissue_at, on, tip_radius_m=tip.radius_m, mount=mount)
+    plant.motion = motion
+    return plant
 
 
-def attach(robot: SimulatedRobot, tabletop: Tabletop) -> None:
+def place_surface(plant: Plant, fields: dict) -> None:
+    """Control port: move the surface; fields ``height_m``, ``tilt_rad``, ``azimuth_rad``."""
+    plant.surface = bench_surface(
+        number(fields.get("height_m"), "height_m"),
+        number(fields.get("tilt_rad", 0.0), "tilt_rad"),
+        number(fields.get("azimuth_rad", 0.0), "azimuth_rad"),
+    )
+
+
+def move_surface(plant: Plant, fields: dict) -> None:
+    """Control port: how the surface moves from now on; fields of `SurfaceMotion`, none: at rest."""
+    asked = {name: value for name, value in fields.items() if name != "command"}
+    plant.motion = read_dataclass(SurfaceMotion, asked, "") if asked else None
+
+
+def truth(plant: Plant) -> dict:
+    """Control port: the true state of the contact."""
+    names = (
+        *("time_s", "tip_m", "site_m", "force_n", "normal_force_n", "contact_s", "depth_m"),
+        *("contact_radius_m", "in_contact", "touches"),
+    )
+    told = {name: getattr(plant, name) for name in names}
+    return told | {"tissue": None if plant.tissue is None else plant.tissue.name}
+
+
+def attach(robot: SimulatedRobot, plant: Plant, library: TissueLibrary) -> None:
     """Add the orders of the table to the robot's control port, and keep its history."""
-    history = PlantHistory(tabletop.plant)
+    history = PlantHistory(plant)
+
+    def place_tissue(fields: dict) -> None:
+        """What the tip finds at its next new place; field ``name``, null for nothing."""
+        name = fields.get("name")
+        tissue = None if name is None else library[str(name)]
+        plant.tissue_at = lambda _: tissue
+
     robot.after_step.append(history.step)
     robot.orders.update(
-        place_surface=tabletop.place_surface,
-        move_surface=tabletop.move_surface,
-        place_tissue=tabletop.place_tissue,
-        truth=lambda fields: {
-            **tabletop.truth(fields),
+        place_surface=partial(place_surface, plant),
+        move_surface=partial(move_surface, plant),
+        place_tissue=place_tissue,
+        truth=lambda _: {
+            **truth(plant),
             "stalls": robot.time.stalls,
             "largest_force_n": history.largest_force_n,
         },

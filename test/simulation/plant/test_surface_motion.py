@@ -8,7 +8,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import LaidScene, Surface, SurfaceMotion
-from tactile_resonance.simulation.plant.tabletop import Tabletop
+from tactile_resonance.simulation.plant.tabletop import move_surface, table_plant
 from tactile_resonance.simulation.plant.tip import RigidTip
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
@@ -90,12 +90,13 @@ def test_a_tip_that_stands_is_pressed_as_the_tissue_rises():
 
 def test_a_scene_and_the_control_port_set_the_motion(library, sensor):
     scene = read_scene(library, share_path("config/scenes/breathing.yaml"))
-    table = Tabletop.of_scene(library, sensor, LaidScene(scene, Pose.at_origin()))
-    assert table.plant.motion == SurfaceMotion(breath_m=1e-3, heart_m=1e-4)
-    table.move_surface({"command": "move_surface", "heart_m": 5e-4})
-    assert table.plant.motion == SurfaceMotion(heart_m=5e-4)
-    table.move_surface({"command": "move_surface"})
-    assert table.plant.motion is None
+    laid = LaidScene(scene, Pose.at_origin())
+    plant = table_plant(library, sensor, laid.surface(), laid.tissue_at, scene.motion)
+    assert plant.motion == SurfaceMotion(breath_m=1e-3, heart_m=1e-4)
+    move_surface(plant, {"command": "move_surface", "heart_m": 5e-4})
+    assert plant.motion == SurfaceMotion(heart_m=5e-4)
+    move_surface(plant, {"command": "move_surface"})
+    assert plant.motion is None
 
 
 def test_wrong_motions_are_refused_by_name():
