@@ -19,7 +19,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Ball, Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -111,7 +111,7 @@ class Rig:
         case: Case,
         setup: Setup,
         *,
-        surface: Surface | None = None,
+        surface: PlantSurface | None = None,
         adhesion_j_per_m2: float = 0.0,
         meets: Callable[[Indenter], Ball] | None = None,
         period_s: float = 0.002,
@@ -119,7 +119,7 @@ class Rig:
         self.touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], case.radius_m)
         bench = self.bench = ContactBench(
             case.tissue(),
-            surface or Surface.tilted(case.height_m, case.tilt_rad, 2.0 * case.seed),
+            surface or PlantSurface.tilted(case.height_m, case.tilt_rad, 2.0 * case.seed),
             Pose(self.touch.position_m + [0, 0, STANDOFF_M], self.touch.rotation_rad),
             tip=Tip(
                 case.radius_m,

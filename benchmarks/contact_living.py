@@ -17,7 +17,7 @@ from tactile_resonance.contact.goal import Aim, ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.simulation.plant.surfaces import Surface, SurfaceMotion
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Ball, OnSoft, bone, clinging
 from tactile_resonance.simulation.tissue.indenter import Indenter
 
@@ -234,7 +234,7 @@ def drawn(row: Row, seed: int) -> tuple[Rig, float]:
     if row.curvature_m:
         # its top, or bottom, at the height of the case and up to 1 mm beside the place asked for
         place = np.array([*rng.uniform(-1e-3, 1e-3, 2), case.height_m])
-        surface = Surface(place, np.array([0.0, 0.0, 1.0]), 1 / row.curvature_m)
+        surface = PlantSurface(place, np.array([0.0, 0.0, 1.0]), 1 / row.curvature_m)
     rig = Rig(
         case,
         Setup(row.name, beam=row.beam),

@@ -24,7 +24,7 @@ from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.surface import Plane
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -93,7 +93,7 @@ def point_times(skipping: Skipping, seed: int = 1) -> PointTimes:
     touches = [touch_pose(p.position_m, UP, [1.0, 0.0, 0.0], radius_m) for p in points]
     bench = ContactBench(
         read_tissues().gelatine(10.0),
-        Surface.tilted(0.0, 0.0),
+        PlantSurface.tilted(0.0, 0.0),
         Pose(touches[0].position_m + [0, 0, START_M], touches[0].rotation_rad),
         tip=Tip(radius_m, sensor_modes(sensor)),
         seed=seed,

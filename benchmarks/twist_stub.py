@@ -23,7 +23,7 @@ from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -59,7 +59,7 @@ class TwistStub:
         start = Pose.from_vector(np.array(TABLE_IN_BASE))
         bench = ContactBench(
             self._tissues["gel10"],
-            Surface(np.array(TABLE_IN_BASE[:3]), np.array([0.0, 0.0, 1.0])),
+            PlantSurface(np.array(TABLE_IN_BASE[:3]), np.array([0.0, 0.0, 1.0])),
             Pose(start.position_m + [0.0, 0.0, CLEAR_M], start.rotation_rad),
             tip=Tip(sensor.tip.radius_m, sensor_modes(sensor)),
             seed=1,

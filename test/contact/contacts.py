@@ -12,7 +12,7 @@ from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.tissue.hertz import Tissue
 
@@ -74,7 +74,7 @@ def contact(
     start = Pose(touch.position_m + [0, 0, start_m], touch.rotation_rad)
     rig = ContactBench(
         tissue,
-        Surface.tilted(height_m, tilt_rad),
+        PlantSurface.tilted(height_m, tilt_rad),
         start,
         tip=tip or Tip(RADIUS_M),
         seed=seed,
@@ -100,4 +100,4 @@ def stiffer(tissue, factor):
 def lower(bench, by_m):
     """Take the tissue away downwards."""
     surface = bench.plant.surface
-    bench.plant.surface = Surface(surface.point_m - np.array([0, 0, by_m]), surface.normal)
+    bench.plant.surface = PlantSurface(surface.point_m - np.array([0, 0, by_m]), surface.normal)

@@ -13,7 +13,7 @@ from tactile_resonance.contact.interfaces import ArmFault, ForceFault, Mount
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, contact
@@ -214,7 +214,7 @@ def test_contact_that_fails_is_drawn_back_to_the_usual_standoff():
     rig.loop.start(goal(rig, 0.0, LOW_M))
     assert rig.run_until(State.HOLD)
     surface = rig.bench.plant.surface
-    rig.bench.plant.surface = Surface(surface.point_m - [0, 0, 0.01], surface.normal)
+    rig.bench.plant.surface = PlantSurface(surface.point_m - [0, 0, 0.01], surface.normal)
     assert rig.run_until(State.IDLE, 4.0)
     assert rig.controller.result.cause is Cause.CONTACT_LOST
     assert height_m(rig) == pytest.approx(P.standoff_m, abs=1e-4)
@@ -224,7 +224,7 @@ def test_surface_above_a_low_standoff_is_refused_before_it_is_pressed_on():
     rig = made()
     states(rig, goal(rig))
     surface = rig.bench.plant.surface
-    rig.bench.plant.surface = Surface(surface.point_m + [0, 0, 1.15e-3], surface.normal)
+    rig.bench.plant.surface = PlantSurface(surface.point_m + [0, 0, 1.15e-3], surface.normal)
     result = rig.loop.make(goal(rig, 0.0, LOW_M))
     assert result.cause is Cause.SURFACE_EARLY
     assert max(rig.force_n) < 1.2 * FORCE_N

@@ -17,7 +17,7 @@ from tactile_resonance.contact.interfaces import ArmFault, ForceFault
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.cell.transducer import CellParameters
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import QUICK, SOFT, stiffer
@@ -196,7 +196,7 @@ def storm(rng, names):
     def breathe():
         turn = 2 * np.pi * 0.3 * rig.bench.clock.time_ns * 1e-9 + phase
         rise = rig.rise_m + breath_m / 2 * (1 + np.sin(turn))
-        rig.bench.plant.surface = Surface(plane.point_m + [0, 0, rise], plane.normal)
+        rig.bench.plant.surface = PlantSurface(plane.point_m + [0, 0, rise], plane.normal)
 
     rig.bench.clock.on_step.insert(0, breathe)
     rig.loop.start(rig.goal)

@@ -25,7 +25,7 @@ from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -134,7 +134,7 @@ class Travel:
     """A bench with nothing to be touched, its controller, and where the tip was in each period."""
 
     def __init__(self, start, limits=LIMITS, tip=TIP, surface=None):
-        surface = Surface.tilted(-0.5) if surface is None else surface
+        surface = PlantSurface.tilted(-0.5) if surface is None else surface
         self.bench = ContactBench(SOFT, surface, start, tip=Tip(RADIUS_M))
         self.controller = ContactController(QUICK, limits, tip)
         rig = self.bench
@@ -210,7 +210,7 @@ def test_points_of_a_sphere_follow_each_other(angle_deg, hollow):
     second = touch_pose(
         centre + (-radius if hollow else radius) * normal, normal, [1, 0, 0], RADIUS_M
     )
-    curved = Surface(np.zeros(3), np.array([0, 0, 1.0]), (-1 if hollow else 1) / radius)
+    curved = PlantSurface(np.zeros(3), np.array([0, 0, 1.0]), (-1 if hollow else 1) / radius)
     made = Travel(raised(first, 2.5e-3), surface=curved)
     for touch in (first, second, first):
         result = made.loop.make(ContactGoal(touch, AIM))

@@ -11,7 +11,7 @@ import pytest
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import OnSoft, RigidTip, clinging
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -129,7 +129,7 @@ def test_surface_above_the_standoff_is_left_before_the_tip_is_idle(tare_drift_n_
 
     def rise():
         up_m = min(3e-3, (made.bench.clock.time_ns - began_ns) * 4e-12)  # 4 mm/s
-        made.bench.plant.surface = Surface(plane.point_m + [0, 0, up_m], plane.normal)
+        made.bench.plant.surface = PlantSurface(plane.point_m + [0, 0, up_m], plane.normal)
 
     began_ns = made.bench.clock.time_ns
     made.bench.clock.on_step.insert(0, rise)

@@ -19,7 +19,7 @@ from tactile_resonance.contact.observer import Zero
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -94,7 +94,7 @@ def test_the_weight_on_a_cell_under_the_sample_does_not_turn_with_the_tip(turned
     touch = touch_pose([0, 0, 0], normal, [1, 0, 0], RADIUS_M)
     turn = Rotation.from_rotvec([0, turned_rad, 0]) * touch.rotation
     start = Pose(touch.position_m + 2.5e-3 * normal, turn.as_rotvec())
-    bench = ContactBench(SOFT, Surface(np.zeros(3), normal), start, tip=Tip(RADIUS_M))
+    bench = ContactBench(SOFT, PlantSurface(np.zeros(3), normal), start, tip=Tip(RADIUS_M))
     controller = ContactController(QUICK, Limits(), under_sample=True)
     loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
     loop.start(ContactGoal(touch, Aim(FORCE_N)))

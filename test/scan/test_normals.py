@@ -22,7 +22,7 @@ from tactile_resonance.scan.scene import ScanScene, parse_scan_scene
 from tactile_resonance.scan.surface import NormalRequest
 from tactile_resonance.scan.surface_search import find_normals, normal_of_touches, places_around
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contact"))
@@ -245,7 +245,7 @@ def test_normal_of_a_sphere_of_tissue_is_found_by_contacts(hollow):
     # the ball touches level with the point, its centre straight above it; a level normal is expected there
     centre = np.array([0, 0, RADIUS_M]) + (7.5e-3 if hollow else -12.5e-3) * true
     curved = -100.0 if hollow else 100.0
-    surface = Surface(centre + true / curved, true, curved)
+    surface = PlantSurface(centre + true / curved, true, curved)
     told = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
     start = Pose(told.position_m + [0, 0, 3e-3], told.rotation_rad)
     bench = ContactBench(SOFT, surface, start, tip=Tip(RADIUS_M), seed=1)

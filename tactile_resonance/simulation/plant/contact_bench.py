@@ -29,7 +29,7 @@ from tactile_resonance.contact.vectors import six, vector
 from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
 from tactile_resonance.simulation.noise import Jitter, Seed
 from tactile_resonance.simulation.plant.plant import Plant
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
@@ -348,7 +348,7 @@ class ContactBench:
     ----------
     tissue : Tissue
         Everywhere under the surface.
-    surface : Surface
+    surface : PlantSurface
         What takes its place later must be curved alike.
     start : Pose
         Of the tip.
@@ -374,7 +374,7 @@ class ContactBench:
     def __init__(
         self,
         tissue: Tissue,
-        surface: Surface,
+        surface: PlantSurface,
         start: Pose,
         *,
         tip: Tip | None = None,

@@ -27,7 +27,7 @@ from tactile_resonance.contact.vectors import (
     vector,
 )
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.plant.surfaces import Surface, SurfaceMotion
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import TipOnTissue
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.ur5e.poses import IDENTITY, ORIGIN, Transform, beside
@@ -56,7 +56,7 @@ class Plant:
 
     Parameters
     ----------
-    surface : Surface
+    surface : PlantSurface
         May be exchanged while the plant runs (``plant.surface = ...``).
     tissue_at : callable
         From a position (3,) [m] in the base to the tissue under it; None where there is nothing to
@@ -102,7 +102,7 @@ class Plant:
 
     def __init__(
         self,
-        surface: Surface,
+        surface: PlantSurface,
         tissue_at: Callable[[FloatArray], Tissue | None],
         tip: Callable[[Tissue], TipOnTissue],
         *,

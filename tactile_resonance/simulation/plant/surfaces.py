@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Surface:
+class PlantSurface:
     """A plane, a sphere of tissue, touched from outside, or a hollow in tissue, touched from inside.
 
     Heights above a sphere are radial, so that a ball of radius r is pressed in by r less the height of its
@@ -40,7 +40,7 @@ class Surface:
     curvature_per_m: float = 0.0
 
     @classmethod
-    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> Surface:
+    def tilted(cls, height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> PlantSurface:
         """Return the plane through (0, 0, height), its normal tilted from +z towards an azimuth."""
         sine = math.sin(tilt_rad)
         normal = [sine * math.cos(azimuth_rad), sine * math.sin(azimuth_rad), math.cos(tilt_rad)]
@@ -69,7 +69,7 @@ class Surface:
         return (away - 1) / self.curvature_per_m, scaled(1 / away, out)
 
 
-def relative_radius_m(tip_radius_m: float, surface: Surface) -> float:
+def relative_radius_m(tip_radius_m: float, surface: PlantSurface) -> float:
     """Radius R of the ball that a flat surface would have to meet to be pressed alike [m].
 
     ``1 / R = 1 / r + k`` for a ball of radius r on a surface of curvature k (Hertz 1882; Johnson, *Contact
@@ -145,9 +145,9 @@ class LaidScene:
     scene: PhantomScene
     table: Pose
 
-    def surface(self) -> Surface:
+    def surface(self) -> PlantSurface:
         """The undisturbed surface in the base."""
-        return Surface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
+        return PlantSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
 
     def tissue_at(self, position_m: FloatArray) -> Tissue | None:
         """What the tip touches under a place (3,) in the base."""

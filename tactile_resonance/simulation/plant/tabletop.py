@@ -29,7 +29,7 @@ from tactile_resonance.simulation.cell.transducer import LoadCell
 from tactile_resonance.simulation.plant.defaults import MOST_STEPS
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
-from tactile_resonance.simulation.plant.surfaces import Surface, SurfaceMotion
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Tip, TipOnTissue
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -120,18 +120,18 @@ TIP_IN_FLANGE = Pose(np.array([0.0, 0.0, 0.12]), np.array([0.0, math.pi, 0.0]))
 """Where the tip sits: 0.12 m before the flange, its z against the flange's."""
 
 
-def bench_surface(height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> Surface:
-    """Return `Surface.tilted` in the robot's base; ValueError where a bench has no such surface."""
+def bench_surface(height_m: float, tilt_rad: float = 0.0, azimuth_rad: float = 0.0) -> PlantSurface:
+    """Return `PlantSurface.tilted` in the robot's base; ValueError where a bench has no such surface."""
     require(-1 <= height_m <= 1, "surface_height_m", height_m, "-1 to 1")
     require(abs(tilt_rad) <= 0.35, "tilt_rad", tilt_rad, "-0.35 to 0.35 (20 degrees)")
     require(math.isfinite(azimuth_rad), "azimuth_rad", azimuth_rad, "a number")
-    return Surface.tilted(height_m, tilt_rad, azimuth_rad)
+    return PlantSurface.tilted(height_m, tilt_rad, azimuth_rad)
 
 
 def table_plant(
     library: TissueLibrary,
     sensor: SensorParameters,
-    surface: Surface,
+    surface: PlantSurface,
     tissue_at: Callable[[FloatArray], Tissue | None],
     motion: SurfaceMotion | None = None,
     *,
@@ -144,7 +144,7 @@ def table_plant(
     ----------
     library : TissueLibrary
     sensor : SensorParameters
-    surface : Surface
+    surface : PlantSurface
         The undisturbed surface in the robot's base.
     tissue_at : callable
         As a `Plant` asks for it.

@@ -10,7 +10,7 @@ from math import ceil, sqrt
 import numpy as np
 
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.plant.surfaces import Surface, relative_radius_m
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
 from tactile_resonance.simulation.sensor.bimorph import BeamModes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Beam, Indenter, Motion, swing
@@ -249,7 +249,7 @@ class Tip:
     adhesion_j_per_m2: float = 0.0
     meets: Callable[[Indenter], Ball] | None = None
 
-    def on(self, tissue: Tissue, surface: Surface) -> TipOnTissue:
+    def on(self, tissue: Tissue, surface: PlantSurface) -> TipOnTissue:
         """Return the tip at rest over a tissue with that surface."""
         radius_m = relative_radius_m(self.radius_m, surface)
         soft = Indenter(

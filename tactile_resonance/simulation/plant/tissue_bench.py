@@ -16,7 +16,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -81,7 +81,7 @@ def indent_tissue(
     touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], radius_m)
     bench = ContactBench(
         tissue,
-        Surface.tilted(0.0, 0.0),
+        PlantSurface.tilted(0.0, 0.0),
         Pose(touch.position_m + [0, 0, START_M], touch.rotation_rad),
         tip=Tip(radius_m, None if rigid else modes, poisson_ratio),
         seed=seed,

@@ -8,7 +8,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.noise import Jitter
 from tactile_resonance.simulation.plant.contact_bench import ContactBench, TipMotion
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
 from test.contact.contacts import SOFT
 
@@ -76,7 +76,7 @@ def test_vibration_is_not_reported_by_the_encoders():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_noise_of_the_cell_is_not_what_shakes_the_arm(seed):
-    rig = ContactBench(SOFT, Surface.tilted(0.0, 0.0), START, seed=seed)
+    rig = ContactBench(SOFT, PlantSurface.tilted(0.0, 0.0), START, seed=seed)
     places, forces, count = [], [], 2000
     for _ in range(count):
         rig.clock.wait_until(rig.clock.time_ns + 2_000_000)
@@ -96,7 +96,7 @@ def test_bias_of_the_cell_drifts_by_the_stated_rate_whatever_its_period():
     drifting = CellParameters("drifts", 1e4, 1e4, 0.0, 0.0, 5.0, 0.3, force_drift_n_per_s=0.2)
     for period_s in (0.001, 0.002, 0.004):
         rig = ContactBench(
-            SOFT, Surface.tilted(0.0, 0.0), START, cell_parameters=drifting, period_s=period_s
+            SOFT, PlantSurface.tilted(0.0, 0.0), START, cell_parameters=drifting, period_s=period_s
         )
         rig.clock.wait_until(1_004_000_000)
         samples = rig.cell.read()

@@ -11,7 +11,7 @@ from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.plant.plant import SLIP, Plant
-from tactile_resonance.simulation.plant.surfaces import Surface, relative_radius_m
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
 from tactile_resonance.simulation.plant.tip import (
     BONE_PA,
     BONE_POISSON_RATIO,
@@ -36,7 +36,7 @@ def rigid(tissue):
 
 
 def plant(tissue=ELASTIC, *, surface=None, tip=rigid, **options):
-    surface = Surface.tilted(0.0) if surface is None else surface
+    surface = PlantSurface.tilted(0.0) if surface is None else surface
     return Plant(surface, lambda _: tissue, tip, tip_radius_m=RADIUS_M, **options)
 
 
@@ -63,7 +63,7 @@ def test_force_of_a_pressed_ball_is_that_of_hertz_along_the_normal():
 
 def test_tilted_surface_pushes_along_its_normal_and_slides_with_friction():
     tilt = np.deg2rad(10)
-    p = plant(surface=Surface.tilted(0.0, tilt, 0.0), friction=0.0)
+    p = plant(surface=PlantSurface.tilted(0.0, tilt, 0.0), friction=0.0)
     normal = np.array([np.sin(tilt), 0, np.cos(tilt)])
     for depth in np.linspace(-1e-4, 4e-4, 26):
         p.step(at(*(normal * RADIUS_M - [0, 0, depth])), 0.002)
@@ -77,7 +77,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def sphere(centre_m, radius_m, hollow):
     curvature = -1 / radius_m if hollow else 1 / radius_m
-    return Surface(centre_m + UP / curvature, UP, curvature)
+    return PlantSurface(centre_m + UP / curvature, UP, curvature)
 
 
 @pytest.mark.parametrize("hollow", [False, True])
@@ -100,9 +100,9 @@ def test_sphere_pushes_along_its_own_normal_with_the_force_of_two_curved_bodies(
 
 
 def test_sphere_without_bounds_is_a_plane_and_a_ball_must_fit_into_its_hollow():
-    assert relative_radius_m(RADIUS_M, Surface.tilted(0.1)) == RADIUS_M
+    assert relative_radius_m(RADIUS_M, PlantSurface.tilted(0.1)) == RADIUS_M
     for hollow in (False, True):
-        far = Surface(np.zeros(3), UP, -1e-6 if hollow else 1e-6)
+        far = PlantSurface(np.zeros(3), UP, -1e-6 if hollow else 1e-6)
         height, normal = far.height_of((0.01, 0.02, 3e-3))
         assert height == pytest.approx(3e-3, abs=1e-9)
         np.testing.assert_allclose(normal, [0, 0, 1], atol=1e-7)
@@ -173,7 +173,7 @@ def test_a_fresh_place_is_unrelaxed_and_the_old_one_remembers():
 def test_what_is_felt_is_what_lies_under_the_touch_not_where_the_tip_came_near():
     """On tissue whose modulus rises along x, touched at several places closer than a ball's radius."""
     p = Plant(
-        Surface.tilted(0.0),
+        PlantSurface.tilted(0.0),
         lambda place: Tissue("slope", 10e3 * (1 + 100 * place[0]), (), ()),
         rigid,
         tip_radius_m=RADIUS_M,
@@ -191,7 +191,7 @@ def test_what_is_felt_is_what_lies_under_the_touch_not_where_the_tip_came_near()
 
 
 def test_nothing_there_is_nothing_felt():
-    p = Plant(Surface.tilted(0.0), lambda _: None, rigid, tip_radius_m=RADIUS_M)
+    p = Plant(PlantSurface.tilted(0.0), lambda _: None, rigid, tip_radius_m=RADIUS_M)
     p.step(at(0, 0, 0), 0.002)
     np.testing.assert_array_equal(p.force_n, 0)
 
@@ -252,7 +252,7 @@ def test_beam_keeps_swinging_while_the_tip_comes_down_along_a_tilt():
         )
         return made[-1]
 
-    tilted = Surface.tilted(0.0, np.deg2rad(10.0))
+    tilted = PlantSurface.tilted(0.0, np.deg2rad(10.0))
     p = Plant(tilted, lambda _: Tissue("soft", 10e3, (), ()), sprung, tip_radius_m=RADIUS_M)
     for height in np.linspace(4e-3, -3e-4, 500):
         p.step(at(0, 0, RADIUS_M + height), 0.002)

@@ -7,7 +7,7 @@ import pytest
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.plant import Plant
-from tactile_resonance.simulation.plant.surfaces import LaidScene, Surface, SurfaceMotion
+from tactile_resonance.simulation.plant.surfaces import LaidScene, PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tabletop import move_surface, table_plant
 from tactile_resonance.simulation.plant.tip import RigidTip
 from tactile_resonance.simulation.tissue.hertz import Tissue
@@ -66,7 +66,7 @@ def test_phases_follow_from_the_seed():
 def test_a_tip_that_stands_is_pressed_as_the_tissue_rises():
     """Hertz at the depth that place and motion make, on a surface that is tilted."""
     tilt, depth_m = 0.2, 3e-4
-    surface = Surface.tilted(0.1, tilt)
+    surface = PlantSurface.tilted(0.1, tilt)
     tissue = Tissue("elastic", MODULUS_PA, (), ())
 
     def tip(found):

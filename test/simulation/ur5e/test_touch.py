@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.plant.plant import Plant
-from tactile_resonance.simulation.plant.surfaces import Surface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import RigidTip
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
@@ -35,7 +35,7 @@ def hertz(depth_m: float) -> float:
 def plant() -> Plant:
     rubber = Tissue("rubber", MODULUS_PA, (), ())
     return Plant(
-        Surface.tilted(TOUCH_Z - RADIUS_M),
+        PlantSurface.tilted(TOUCH_Z - RADIUS_M),
         lambda _: rubber,
         lambda tissue: RigidTip(Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=POISSON)),
         tip_radius_m=RADIUS_M,
