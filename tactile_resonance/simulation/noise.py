@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numba import float64, njit
-from numba.types import UniTuple
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.contact.vectors import Vector
 
 Seed = int | Sequence[int] | np.random.SeedSequence | np.random.Generator
 """What ``numpy.random.default_rng`` takes; a generator is drawn from as it is."""
@@ -19,8 +19,8 @@ ROWS = 64
 """Drawn at once: one call costs as much as some hundred numbers, and must not hold up a step."""
 
 
-class NormalRows:
-    """Rows of independent normal numbers, without end.
+def normal_rows(seed: Seed, rms: Sequence[float]) -> Iterator[FloatArray]:
+    """Yield rows (width,) of independent normal numbers, without end.
 
     They are drawn in blocks: a generator that is handed in is ahead of what has been taken.
 
@@ -30,18 +30,9 @@ class NormalRows:
     rms : sequence of float
         Standard deviation of each number of a row.
     """
-
-    def __init__(self, seed: Seed, rms: Sequence[float]) -> None:
-        self._random = np.random.default_rng(seed)
-        self._rms = np.array(rms)  # (width,)
-        self._left: list[FloatArray] = []  # the next row last
-
-    def take(self) -> FloatArray:
-        """Return the next row, (width,)."""
-        if not self._left:
-            numbers = self._rms * self._random.standard_normal((ROWS, self._rms.size))
-            self._left = [*reversed(numbers)]
-        return self._left.pop()
+    random, each = np.random.default_rng(seed), np.array(rms)
+    while True:
+        yield from each * random.standard_normal((ROWS, each.size))
 
 
 class Jitter:
@@ -75,20 +66,29 @@ class Jitter:
     def reseed(self, seed: Seed) -> None:
         """Let vibration follow from a seed, from the next step on, beginning in a state drawn anew."""
         random = np.random.default_rng(seed)
-        self._state = self._rms[:, None] * random.standard_normal((2, 3))  # places and speeds
-        self._rows = NormalRows(random, [1.0] * 6)
+        state = self._rms[:, None] * random.standard_normal((2, 3))  # places and speeds
+        self._places = self._from(state, random)
 
-    def step(self) -> tuple[float, float, float]:
+    def step(self) -> Vector:
         """Advance one period; return the displacement [m]."""
-        return _tremble(self._state, self._by, self._rows.take())
+        return next(self._places)
+
+    def _from(self, state: FloatArray, random: np.random.Generator) -> Iterator[Vector]:
+        """Place after place, from a block of noise each."""
+        while True:
+            places = _tremble(state, self._by, random.standard_normal((ROWS, 6)))
+            yield from map(tuple, places.tolist())
 
 
-@njit(UniTuple(float64, 3)(float64[:, ::1], float64[:, ::1], float64[::1]), cache=True)
+@njit(float64[:, ::1](float64[:, ::1], float64[:, ::1], float64[:, ::1]), cache=True)
 def _tremble(state, by, noise):
-    """Advance place and speed of three axes; return the place."""
-    for k in range(3):
-        place, speed, first, second = state[0, k], state[1, k], noise[k], noise[3 + k]
-        for n in range(2):
-            a, b, c, d = by[n, 0], by[n, 1], by[n, 2], by[n, 3]
-            state[n, k] = a * place + b * speed + c * first + d * second
-    return state[0, 0], state[0, 1], state[0, 2]
+    """Advance place and speed of three axes, once for each row of noise; return the places (rows, 3)."""
+    places = np.empty((len(noise), 3))
+    for row in range(len(noise)):
+        for k in range(3):
+            place, speed, first, second = state[0, k], state[1, k], noise[row, k], noise[row, 3 + k]
+            for n in range(2):
+                a, b, c, d = by[n, 0], by[n, 1], by[n, 2], by[n, 3]
+                state[n, k] = a * place + b * speed + c * first + d * second
+            places[row, k] = state[0, k]
+    return places

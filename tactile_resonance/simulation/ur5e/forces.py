@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,8 +13,16 @@ from numba.types import UniTuple
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Turn, Vector, cross, rotated, rotated_back
-from tactile_resonance.simulation.noise import NormalRows
-from tactile_resonance.simulation.ur5e.poses import ORIGIN, ZERO, Six, Transform, beside, difference
+from tactile_resonance.simulation.noise import ROWS
+from tactile_resonance.simulation.ur5e.poses import (
+    ORIGIN,
+    ZERO,
+    Six,
+    Transform,
+    beside,
+    difference,
+    total,
+)
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -95,10 +104,11 @@ class FtSensor:
     def __init__(self, specification: FtSpecification, random: np.random.Generator) -> None:
         self._offset = specification.accuracy / 2 * random.standard_normal(6)
         sigma = specification.precision / 2
-        self._noise = (sigma * np.sqrt(1 - specification.drift_share)).tolist()
         self._drift_rms = sigma * np.sqrt(specification.drift_share)
-        self._keep = float(np.exp(-CYCLE_S / specification.drift_time_s))
-        self._kick = (self._drift_rms * np.sqrt(1 - self._keep**2)).tolist()
+        keep = np.exp(-CYCLE_S / specification.drift_time_s)
+        self._keep = keep ** np.arange(1.0, ROWS + 1)[:, None]
+        kick = self._drift_rms * np.sqrt(1 - keep**2)
+        self._rms = np.concatenate([kick, sigma * np.sqrt(1 - specification.drift_share)])
         self.reseed(random)
         self._zero = ZERO
         self._free = ZERO
@@ -106,8 +116,15 @@ class FtSensor:
 
     def reseed(self, random: np.random.Generator) -> None:
         """Take all noise from the next step on from a generator, drift drawn anew; the offset stays."""
-        self._drift = self._drift_rms * random.standard_normal(6)
-        self._rows = NormalRows(random, [*self._kick, *self._noise])
+        self._errors = self._from(self._drift_rms * random.standard_normal(6), random)
+
+    def _from(self, drift: FloatArray, random: np.random.Generator) -> Iterator[Six]:
+        """What is read beside the truth, cycle by cycle: offset, drift and noise."""
+        while True:
+            numbers = self._rms * random.standard_normal((ROWS, 12))
+            drifts = self._keep * (drift + np.cumsum(numbers[:, :6] / self._keep, axis=0))
+            drift = drifts[-1]
+            yield from map(tuple, (self._offset + drifts + numbers[:, 6:]).tolist())
 
     def step(self, true: Six, payload_weight: Six, external: Six | None = None) -> None:
         """Measure for one cycle; all wrenches at and in the flange.
@@ -121,7 +138,7 @@ class FtSensor:
         external : 6 floats, optional
             Measured by another sensor, to be used in place of this one's reading.
         """
-        self.raw = _read(self._drift, self._offset, self._rows.take(), true, self._keep)
+        self.raw = total(true, next(self._errors))
         self._free = difference(self.raw if external is None else external, payload_weight)
 
     def zero(self) -> None:
@@ -139,21 +156,6 @@ class FtSensor:
             Place of the TCP in the flange.
         """
         return _at_tcp(self._free, self._zero, flange, tcp_m)
-
-
-@njit(_6(float64[::1], float64[::1], float64[::1], _6, float64), cache=True)
-def _read(drift, offset, noise, true, keep):
-    """Let the drift go on for a cycle, and return what the sensor reads."""
-    for k in range(6):
-        drift[k] = keep * drift[k] + noise[k]
-    return (
-        true[0] + offset[0] + drift[0] + noise[6],
-        true[1] + offset[1] + drift[1] + noise[7],
-        true[2] + offset[2] + drift[2] + noise[8],
-        true[3] + offset[3] + drift[3] + noise[9],
-        true[4] + offset[4] + drift[4] + noise[10],
-        true[5] + offset[5] + drift[5] + noise[11],
-    )
 
 
 @njit(_6(_6, _6, UniTuple(float64, 9), UniTuple(float64, 3)), cache=True)
