@@ -144,8 +144,8 @@ class SocketcandServer(TcpBus):
 
     def text_of(self, frame: CanFrame) -> bytes:
         """As it is sent, with its time."""
-        text = hexlify(frame.data).upper()
-        return b"< frame %03X %.6f %s >" % (frame.can_id, self.epoch_s + frame.time_s, text)
+        time_s, can_id, data = frame
+        return b"< frame %03X %.6f %s >" % (can_id, self.epoch_s + time_s, hexlify(data).upper())
 
     def talk(self, client: BusClient) -> Serving:
         """Execute the messages of a client."""

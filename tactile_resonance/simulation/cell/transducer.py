@@ -27,7 +27,7 @@ from tactile_resonance.simulation.noise import Seed, normal_rows
 from tactile_resonance.simulation.ur5e.poses import Six
 
 Counts = tuple[int, ...]
-"""Of the six axes."""
+"""Of the six axes, and overload bits."""
 
 SAMPLE_PERIOD_S = 0.001
 """The cell converts at 1 kHz, the fastest rate that it can send."""
@@ -208,10 +208,8 @@ class Transducer:
         """Take the present reading as zero, or end that."""
         self._axes["zero"] = self._axes["signal"] + self._axes["noise"] if on else 0.0
 
-    def convert(
-        self, load: Six, before: Six | None = None, part: float = 1.0
-    ) -> tuple[Counts, int]:
-        """Convert once: from the wrench on the cell, 6 [N, N m], to six counts and overload bits.
+    def convert(self, load: Six, before: Six | None = None, part: float = 1.0) -> Counts:
+        """Convert once: from the wrench on the cell, 6 [N, N m], to six counts and, last, overload bits.
 
         Bit 5 belongs to Fx, bit 0 to Tz.
 
@@ -226,14 +224,14 @@ class Transducer:
         signal_keep = keep if self._read else 0.0
         noise_keep = -1.0 if self._noise_begins else keep
         self._read, self._noise_begins = True, False
-        converted = _convert(
+        converted: Counts = _convert(
             *(self._axes, load if before is None else before, load, part, next(self._rows)),
             *(keep, signal_keep, noise_keep, faults.flipped, faults.bias_step_n, faults.stuck),
         )
-        counts, bits = converted[:6], converted[6]
         if faults.saturated or faults.invalid:
-            counts = (*counts[:2], NO_NUMBER if faults.invalid else LARGEST_COUNT, *counts[3:])
-        return counts, bits
+            z = NO_NUMBER if faults.invalid else LARGEST_COUNT
+            return *converted[:2], z, *converted[3:]
+        return converted
 
 
 READ_MODEL, READ_SERIAL, READ_FIRMWARE = 0x01, 0x02, 0x03
@@ -261,6 +259,7 @@ class CanFrame(NamedTuple):
 
 COMMAND_ID, RESPONSE_IDS = 0x64, (0x001, 0x002)
 """Identifiers of the frames that it takes, and of those that it sends."""
+_WRENCH = struct.Struct(">B6hB")
 
 
 class LoadCell(Transducer):
@@ -279,8 +278,7 @@ class LoadCell(Transducer):
         self._time_s: float | None = None
         self._ticks = self._sent = 0
         self._wrench: tuple[float, ...] = (0.0,) * 6
-        self._counts: tuple[int, ...] = (0,) * 6
-        self._bits = 0
+        self._counts: Counts = (0,) * 7
 
     def step(self, wrench: Iterable[float], time_s: float) -> list[CanFrame]:
         """Advance to a time of the plant, at which `wrench`, 6 [N, N m], acts on the cell.
@@ -300,7 +298,7 @@ class LoadCell(Transducer):
         while self._time_s + SAMPLE_PERIOD_S <= time_s + 1e-9:
             self._time_s += SAMPLE_PERIOD_S
             part = (self._time_s - start_s) / span_s
-            self._counts, self._bits = self.convert(load, before, part)
+            self._counts = self.convert(load, before, part)
             self._ticks += 1
             if self.streaming and self._ticks % DECIMATIONS[self._rate_code] == 0:
                 frames += self._wrench_frames(START)
@@ -368,14 +366,13 @@ class LoadCell(Transducer):
         if self.faults.silent:
             return []
         self._sent += 1
-        frames = self._frames(struct.pack(">B6hB", command, *self._counts, self._bits))
+        frames = self._frames(_WRENCH.pack(command, *self._counts))
         every = self.faults.lose_second_every
         return frames[:1] if every and self._sent % every == 0 else frames
 
     def _frames(self, response: bytes) -> list[CanFrame]:
-        whole = response.ljust(16, b"\0")
-        parts = zip(RESPONSE_IDS, (whole[:8], whole[8:]), strict=True)
-        return [CanFrame(self._time_s or 0.0, can_id, part) for can_id, part in parts]
+        (first, second), whole, time_s = RESPONSE_IDS, response.ljust(16, b"\0"), self._time_s or 0.0
+        return [CanFrame(time_s, first, whole[:8]), CanFrame(time_s, second, whole[8:])]
 
 
 def _result(good: bool) -> bytes:

@@ -327,7 +327,7 @@ class VirtualCell(Transducer):
 
     def _measure(self) -> None:
         force_n, torque_nm = self._bench.plant.wrench_at_cell()
-        counts, bits = self.convert((*force_n, *torque_nm))
+        *counts, bits = self.convert((*force_n, *torque_nm))
         self._count += 1
         every = self.faults.lose_second_every
         if self.faults.silent or (every and self._count % every == 0):
