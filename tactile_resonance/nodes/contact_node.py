@@ -16,6 +16,7 @@ from tactile_resonance.contact.cell_checks import require_fit
 from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
 from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceInfo, NodeArm
 from tactile_resonance.contact.loop import Cycle, IndentationRecorder
+from tactile_resonance.contact.machine import PRESSING_CAUSES
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.result import (
     Cause,
@@ -368,7 +369,9 @@ class ContactNode(ManagedNode):
             thread.retract()
         result = controller.result
         over = True
-        if self._test is not None:  # it ends with the tip drawn back
+        # until the tip is drawn back the force may rise
+        pressed_too_hard = result is not None and result.cause in PRESSING_CAUSES
+        if self._test is not None or pressed_too_hard:
             over = controller.settled
         elif goal.is_cancel_requested:
             over = controller.state in (State.IDLE, State.FAULT)

@@ -4,6 +4,7 @@
 import os
 import threading
 from contextlib import ExitStack
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -14,6 +15,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 
 from tactile_resonance.contact.goal import State
 from tactile_resonance.contact.parameters import (
@@ -23,7 +25,7 @@ from tactile_resonance.contact.parameters import (
     ranges_of,
     read_contact,
 )
-from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.result import Cause, ContactResult
 from tactile_resonance.nodes import contact_node
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
@@ -82,6 +84,22 @@ def test_a_limit_that_protects_the_tissue_is_made_stricter_and_never_laxer(launc
     assert ask(node, **{name: below}) == ""
     assert node.get_parameter(full(name)).value == below
     assert ask(node, **{name: limit}) == ""  # back to what the launch set
+
+
+def test_result_of_a_contact_that_pressed_too_hard_has_its_largest_force(launch):
+    node, given_up = launch(), ContactResult(False, Cause.FORCE_ABORT, "", 1.0, 0.03)
+    controller = SimpleNamespace(state=State.RETRACT, result=given_up, settled=False)
+    clock = SimpleNamespace(simulated=True)
+    node._thread = SimpleNamespace(error=None, controller=controller, clock=clock)
+    node._teller = SimpleNamespace(is_canceled=lambda: False)
+    node._goal, node._finished = SimpleNamespace(is_cancel_requested=False), Future()
+    node._test, node._dead = None, False
+    node._look()
+    assert not node._finished.done()
+    controller.result, controller.settled = replace(given_up, peak_force_n=0.15), True
+    node._look()
+    assert node._finished.result().peak_force_n == 0.15
+    node._thread = None
 
 
 def test_a_cell_that_carries_nothing_at_the_launch_carries_nothing_later(launch):
