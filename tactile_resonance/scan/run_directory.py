@@ -130,7 +130,7 @@ class RunDirectory:
         scene : str
             Text of the scene file.
         points : sequence of ScanPoint
-            The plan, in order.
+            The plan, in order, numbered from 0.
         facts : mapping
             What JSON can hold: versions, seeds, what the plan skips.
         needed_bytes : int
@@ -143,15 +143,11 @@ class RunDirectory:
         Raises
         ------
         ValueError
-            If the folder holds something, the plan is empty or misnumbered, or space is short; nothing
-            is left behind.
+            If the folder holds something, or space is short; nothing is left behind.
         OSError
             If it cannot be written.
         """
         path = Path(path)
-        if [point.index for point in points] != list(range(len(points))) or not points:
-            indices = [point.index for point in points][:10]
-            raise ValueError(f"points: got indices {indices}; accepted are 0, 1, 2 ... in order")
         cls.check_new(path, needed_bytes)
         text = _plan_text(RunContent(path, scene, facts, tuple(points), places=tuple(places)))
         (path / RECORDING).mkdir(parents=True)
@@ -337,21 +333,13 @@ class PointRecording:
         return serialised(result, poles)
 
     def finish(self, result: PointResult) -> bytes:
-        """Keep all with the result, durably: after this no interruption loses it.
+        """Keep all with the result of this point and attempt, durably: no interruption loses it from now on.
 
         Returns
         -------
         bytes
             `message_of` the result.
-
-        Raises
-        ------
-        ValueError
-            If the result is of another point or attempt.
         """
-        got, own = (result.index, result.attempt), (self.index, self.attempt)
-        if self.index is not None and got != own:
-            raise ValueError(f"result: got point and attempt {got}; accepted is {own}")
         cdr, qos = self.message_of(result), offered_qos(RESULTS_DEPTH, latched=True)
         self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr, qos)
         of_point, run = None if self.index is None else result, self._run

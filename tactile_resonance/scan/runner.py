@@ -323,13 +323,6 @@ class ScanRunner:
         if silent:
             design = replace(design, silent=True)
             point = replace(point, label=SILENT)
-        told = 0
-
-        def all_blocks(_: Measured, blocks: int) -> bool:
-            nonlocal told
-            told = blocks
-            return False
-
         disturbed = Disturbances()
         while True:
             self._wait()
@@ -342,7 +335,7 @@ class ScanRunner:
                         design,
                         point.label,
                         self._seed + point.index,
-                        all_blocks,
+                        lambda measured, blocks: False,
                         recording,
                         self._controls.check_cancelled,
                     )
@@ -363,7 +356,7 @@ class ScanRunner:
                 result = replace(result, simulated=measured.origin.simulated)
                 if not silent:
                     in_air = replace(self._scene, tissue_classes=(), nominal_contact=None)
-                    decision = Decision(Verdict.MOST_BLOCKS, told)
+                    decision = Decision(Verdict.MOST_BLOCKS, design.periods)
                     result = measured_result(result, in_air, measured, decision)
                 result = replace(result, repeats=disturbed.total, disturbances=str(disturbed))
                 self._publish(recording.finish(result))
