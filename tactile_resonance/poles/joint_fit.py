@@ -381,7 +381,7 @@ def noise_of_moving_modes(
 def _several(first: _Round) -> Judged:
     """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own."""
     rows = np.flatnonzero(first.solution.plain & _weighted_wrongly(first))
-    if rows.size == first.kind.size:
+    if 0 < rows.size == first.kind.size:
         return _with_scatter(first)
     judged = _judged(first, first)
     if rows.size:
