@@ -6,12 +6,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from tactile_resonance.contact.interfaces import ForceError, ForceFault, ForceInfo
 from tactile_resonance.contact.vectors import Six
-from tactile_resonance.fields import require
+from tactile_resonance.fields import Checked, Range
 
 REFERENCE_RATE_HZ = 500.0
 """The control loop's. White noise of another rate is compared by its density."""
@@ -79,7 +80,7 @@ LOST_WITHIN = 100
 
 
 @dataclass(frozen=True)
-class CellLimits:
+class CellLimits(Checked):
     """When a sensor is called faulty.
 
     Attributes
@@ -96,20 +97,11 @@ class CellLimits:
         Wrenches lost among the last hundred.
     """
 
-    silent_s: float = 0.010
-    stuck_samples: int | None = None
-    jump_n: float = math.inf
-    overload_samples: int = 3
-    lost_tolerated: int = 3
-
-    def __post_init__(self) -> None:
-        require(0 < self.silent_s <= 1, "silent_s", self.silent_s, "above 0 to 1 s")
-        stuck = self.stuck_samples
-        require(stuck is None or stuck >= 2, "stuck_samples", stuck, "2 or more")
-        require(self.jump_n > 0, "jump_n", self.jump_n, "a number above 0")
-        require(self.overload_samples >= 1, "overload_samples", self.overload_samples, "1 or more")
-        lost = self.lost_tolerated
-        require(0 <= lost < LOST_WITHIN, "lost_tolerated", lost, f"0 to {LOST_WITHIN - 1}")
+    silent_s: Annotated[float, Range(math.ulp(0.0), 1.0, "above 0 to 1 s")] = 0.010
+    stuck_samples: Annotated[int, Range(2, math.inf, "2 or more")] | None = None
+    jump_n: Annotated[float, Range(math.ulp(0.0), math.inf, "a number above 0")] = math.inf
+    overload_samples: Annotated[int, Range(1, math.inf, "1 or more")] = 3
+    lost_tolerated: Annotated[int, Range(0, LOST_WITHIN - 1)] = 3
 
 
 def repeat_probability(noise_rms_n: float, resolution_n: float) -> float:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,11 +43,11 @@ from tactile_resonance.contact.vectors import (
     vector,
     vector_from_turn,
 )
-from tactile_resonance.fields import require
+from tactile_resonance.fields import BelowOne, Checked, Range, require
 
 
 @dataclass(frozen=True)
-class TipGeometry:
+class TipGeometry(Checked):
     """Ball, beam and housing.
 
     Attributes
@@ -59,18 +60,10 @@ class TipGeometry:
         How far the housing reaches below the beam at the clamp [m].
     """
 
-    ball_radius_m: float = 2.5e-3
-    beam_length_m: float = 0.064
-    beam_tilt_rad: float = 0.17
-    housing_below_m: float = 6e-3
-
-    def __post_init__(self) -> None:
-        for name in ("ball_radius_m", "beam_length_m"):
-            value = getattr(self, name)
-            require(0 < value < 1, name, value, "above 0, below 1 m")
-        tilt = self.beam_tilt_rad
-        require(0 <= tilt <= 1, "beam_tilt_rad", tilt, "0 to 1")
-        require(0 <= self.housing_below_m < 1, "housing_below_m", self.housing_below_m, "0 to 1 m")
+    ball_radius_m: BelowOne = 2.5e-3
+    beam_length_m: BelowOne = 0.064
+    beam_tilt_rad: Annotated[float, Range(0, 1)] = 0.17
+    housing_below_m: Annotated[float, Range(0, 1)] = 6e-3
 
     @cached_property
     def sensor(self) -> Pose:
