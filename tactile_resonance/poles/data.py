@@ -243,8 +243,7 @@ def with_noise(
     kind = np.maximum(kind, np.where(generator[:, 0], 0, kind_u))
     if rows.size:  # an input that is known but for the noise of its voltmeter, which the response brings in
         sample, gain = (_power(x[rows]).reshape(rows.size, -1, records).mean(-1) for x in (rest, response))
-        alike = Pieces.of(data.undriven, pieces.size, records)
-        curve, kind[rows] = smooth_variance(sample * free, gain, alike)
+        curve, kind[rows] = smooth_variance(sample * free, gain, Pieces.of(data.undriven, pieces.size, records))
         flat, channels = kind[rows, None] == 0, channels_of(curve, gain)
         driven = channels[:, :1] + channels[:, 1:] * _power(problem.response(theta[rows, 0]))
         of_rest = np.tile(of_rest, (1, data.undriven // of_rest.shape[1]))

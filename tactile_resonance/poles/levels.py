@@ -361,9 +361,8 @@ class Spread:
     def chance(self) -> FloatArray:
         """(batch,) how often one system scatters as much, in f0 or damping of any mode; NaN: not known."""
         p = special.fdtrc(self.records - 1, self.dof[:, None, None], self.ratio)
-        p = np.where(np.isfinite(p), p, np.inf).min(axis=(1, 2), initial=np.inf)
-        known = self.known & np.isfinite(p)
-        return np.where(known, 1 - (1 - np.where(known, p, 1.0)) ** (2 * self.ratio.shape[1]), np.nan)
+        p = np.fmin.reduce(p, axis=(1, 2), initial=np.nan)
+        return np.asarray(1 - (1 - p) ** (2 * self.ratio.shape[1]))
 
     @property
     def weight(self) -> FloatArray:
