@@ -457,7 +457,7 @@ def clocks(x: _Channel) -> Fault | None:
     when = "early" if slope > 0 else "late"
     text = (
         f"Each period of the actuator comes {ppm:.3g} ppm of its length {when}: the generator's clock is not "
-        "the converter's"
+        "the converter's, or the period is no whole number of samples"
     )
     if x.periods <= 3:  # so few are shifted as evenly by samples lost within the second
         text += ", or samples were lost"
