@@ -77,12 +77,6 @@ class ContactPrior:
             return np.array([log_modulus, 0.2, log_radius, 0.0])
         return np.array([log_modulus, -0.5, -np.log(2 * np.pi * self.frequency_hz), log_radius])
 
-    @property
-    def further_start(self) -> FloatArray:
-        """(4,) from where a fit begins that did not come to its end from `start`: with a faster law."""
-        power = self.law is Law.POWER_LAW
-        return self.start + (np.array([0, 0.2, 0, 0]) if power else np.array([0, 0, -1.5, 0]))
-
     def deviations(self, p: FloatArray) -> FloatArray:
         """(..., 3) of parameters (..., 4) from what is expected, in standard deviations."""
         radius = p[..., 2 if self.law is Law.POWER_LAW else 3]

@@ -176,21 +176,8 @@ class CalibratedEstimator:
         low, high = record.frequency_hz[0], record.frequency_hz[-1]
         air_hz = float(f[np.argmin(np.maximum(0, np.maximum(low - f, f - high)))])
         prior = ContactPrior(self.law, self.tip_radius_m, air_hz, force_n, force_std_n)
-        found: list[TissueContact] = []
-        ran_away = np.linalg.LinAlgError()
-        for start in (prior.start, prior.further_start):
-            fit = _Fit(self.calibration, record, prior)
-            try:
-                found.append(fit.result(*fit.solved(start)))
-            except np.linalg.LinAlgError as error:
-                ran_away = error
-                continue
-            if found[-1].status is ContactStatus.OK:
-                return found[-1]
-        if not found:
-            raise ran_away
-        # residuals on the way would contradict any calibration
-        return min(found, key=lambda each: each.status is ContactStatus.NOT_CONVERGED)
+        fit = _Fit(self.calibration, record, prior)
+        return fit.result(*fit.solved(prior.start))
 
 
 class _Fit:
