@@ -229,12 +229,12 @@ class CanWrench:
     def _await_reply(self, bus: Bus, command: CellCommand, within_s: float) -> None:
         reply = self._config.description.commands.reply
         assert reply is not None
-        assembler = self._new_assembler()
+        assembler, last = self._new_assembler(), max(reply.result_byte, reply.error_byte)
         deadline_s = time.monotonic() + within_s
         while time.monotonic() < deadline_s:
             for frame in filter(self._is_of_the_cell, _frames(bus)):
-                whole = assembler.add(frame.can_id, frame.data, frame.stamp_s)
-                if whole is None or whole[0] != command.data[0]:
+                whole = assembler.add(frame.can_id, frame.data, frame.stamp_s) or b""
+                if len(whole) <= last or whole[0] != command.data[0]:
                     continue
                 if whole[reply.result_byte] == reply.good:
                     return

@@ -16,7 +16,11 @@ can = pytest.importorskip("can", reason="python-can is not installed")
 
 from tactile_resonance.drivers import can_bus  # noqa: E402
 from tactile_resonance.drivers.can_wrench import CanWrench  # noqa: E402
-from tactile_resonance.simulation.cell.transducer import CellParameters, LoadCell  # noqa: E402
+from tactile_resonance.simulation.cell.transducer import (  # noqa: E402
+    CanFrame,
+    CellParameters,
+    LoadCell,
+)
 
 PATIENCE_S = 60.0
 FOREIGN = (
@@ -95,6 +99,22 @@ def read_for(driver, count):
         assert time.monotonic() < end_s
         count -= len(driver.read())
         time.sleep(0.001)
+
+
+@pytest.mark.parametrize("data", [b"", b"\x0f"])
+def test_an_answer_that_is_too_short_to_say_what_was_done_is_passed_over(shared, data):
+    bus, driver = shared
+    send = bus.send
+
+    def send_beside(message, timeout=None):
+        now_s = bus.now_ns() * 1e-9
+        # by itself: of the cell's identifiers, with the command's first byte or without any
+        bus._hand_on([CanFrame(now_s, 1, data), CanFrame(now_s, 2, b"")])
+        send(message)
+
+    bus.send = send_beside
+    driver.start()
+    read_for(driver, 20)
 
 
 def test_others_frames_are_passed_over(shared):
