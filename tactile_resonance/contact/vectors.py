@@ -19,6 +19,8 @@ Turn = tuple[float, float, float, float, float, float, float, float, float]
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 NO_TURN: Turn = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+TURN_LEVER_M = 0.1
+"""Turns a limit of acceleration [m/s2] into one of rotation [rad/s2]."""
 _NAN = math.nan
 _UNKNOWN: Turn = (_NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN)
 
@@ -60,6 +62,16 @@ def difference(a: Vector, b: Vector) -> Vector:
 def scaled(factor: float, a: Vector) -> Vector:
     """Return a vector times a number."""
     return factor * a[0], factor * a[1], factor * a[2]
+
+
+def nearer(twist: Six, wanted: Six, step: float) -> Six:
+    """Return a twist nearer to what is wanted, by a change of velocity of `step` [m/s] at most."""
+    change = [b - a for a, b in zip(twist, wanted, strict=True)]
+    largest = max(math.hypot(*change[:3]), TURN_LEVER_M * math.hypot(*change[3:]))
+    if largest <= step:
+        return wanted
+    share = step / largest
+    return six(a + share * d for a, d in zip(twist, change, strict=True))
 
 
 def rotated(turn: Turn, a: Vector) -> Vector:

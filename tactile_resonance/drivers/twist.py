@@ -91,8 +91,6 @@ VELOCITY_OVER_NS = 7_000_000
 """A velocity is the difference of two poses at least so far apart [ns]."""
 FOLLOWED_NS = 1_000_000_000
 """Over so long the way of the tip is compared with what was commanded [ns]."""
-TURN_LEVER_M = 0.1
-"""Turns the limit of acceleration [m/s2] into one of rotation [rad/s2]."""
 
 
 class ToolPose(NamedTuple):
@@ -183,14 +181,3 @@ def velocity_of(tools: Sequence[ToolPose]) -> Six:
     x, y, z = scaled(1 / seconds, difference(newest.tip_m, before.tip_m))
     turned = vector_from_turn(turn_product(newest.turn, transposed(before.turn)))
     return x, y, z, *scaled(1 / seconds, turned)
-
-
-def towards(now: Six, wanted: Six, step: float) -> Six:
-    """Twist nearer to what is wanted, by a change of velocity of `step` [m/s] at most."""
-    change = tuple(b - a for a, b in zip(now, wanted, strict=True))
-    largest = max(math.hypot(*change[:3]), TURN_LEVER_M * math.hypot(*change[3:]))
-    if largest <= step:
-        return wanted
-    share = step / largest
-    a, b, c, d, e, f = (a + share * d for a, d in zip(now, change, strict=True))
-    return a, b, c, d, e, f

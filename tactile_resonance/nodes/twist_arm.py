@@ -31,6 +31,7 @@ from tactile_resonance.contact.vectors import (
     ZERO,
     cross,
     difference,
+    nearer,
     rotated,
     turn_from_quaternion,
     turn_product,
@@ -42,7 +43,6 @@ from tactile_resonance.drivers.twist import (
     Following,
     ToolPose,
     TwistConfig,
-    towards,
     velocity_of,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
@@ -271,7 +271,7 @@ class TwistArm:
                 raise self._fault
             since_s = 0.0 if self._commanded_ns is None else (now_ns - self._commanded_ns) * 1e-9
             step = acceleration_m_s2 * (since_s if self._moving else period_s)
-            self._twist, self._moving = towards(self._twist, wanted, step), True
+            self._twist, self._moving = nearer(self._twist, wanted, step), True
             self._commanded_ns = now_ns
         self._send()
 

@@ -7,7 +7,6 @@ compute. Arm and cell have every fault of real ones.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -25,7 +24,7 @@ from tactile_resonance.contact.interfaces import (
 )
 from tactile_resonance.contact.payload import Mounting, Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
-from tactile_resonance.contact.vectors import six, vector
+from tactile_resonance.contact.vectors import nearer, six, vector
 from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
 from tactile_resonance.simulation.noise import Jitter, Seed
 from tactile_resonance.simulation.plant.plant import Plant
@@ -35,8 +34,6 @@ from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
 
-ROTATION_LEVER_M = 0.1
-"""Lever that turns the acceleration limit [m/s2] into one of rotation [rad/s2]."""
 PROTECTIVE_DECELERATION_M_S2 = 2.0
 """With which the robot brakes without a command (chosen)."""
 WATCHDOG_NS = 40_000_000
@@ -66,8 +63,7 @@ class TipMotion:
         self.period_s = period_s
         self.pose = self.reported = start
         self.twist = np.zeros(6)
-        self._set_twist = np.zeros(6)  # after the acceleration limit
-        self._wanted: FloatArray = np.zeros(6)
+        self._set_twist = self._wanted = six([0.0] * 6)  # after the acceleration limit, and before
         self._acceleration_m_s2 = 1.0
         self._lag = Lag(parameters, [0.0] * 6, period_s)
         self._jitter = Jitter(
@@ -76,14 +72,15 @@ class TipMotion:
 
     def speed(self, twist: Sequence[float] | FloatArray, acceleration_m_s2: float) -> None:
         """Go over to a twist (6,) in the base, under an acceleration limit, and keep it."""
-        self._wanted, self._acceleration_m_s2 = np.array(twist, dtype=float), acceleration_m_s2
+        self._wanted, self._acceleration_m_s2 = six(twist), acceleration_m_s2
 
     def step(self) -> None:
         """Advance one period."""
         dt = self.period_s
-        self._set_twist = self._limited(self._wanted)
+        step = self._acceleration_m_s2 * dt
+        self._set_twist = nearer(self._set_twist, self._wanted, step)
         last = self.twist
-        self.twist = np.array(self._lag.step(self._set_twist.tolist()))
+        self.twist = np.array(self._lag.step(self._set_twist))
         way = (last + self.twist) / 2 * dt
         # the same object where nothing turns, so that what is computed from it can be kept
         rotation = self.reported.rotation_rad
@@ -91,16 +88,6 @@ class TipMotion:
             rotation = (Rotation.from_rotvec(way[3:]) * self.reported.rotation).as_rotvec()
         self.reported = Pose(self.reported.position_m + way[:3], rotation)
         self.pose = Pose(self.reported.position_m + self._jitter.step(), rotation)
-
-    def _limited(self, wanted: FloatArray) -> FloatArray:
-        change = wanted - self._set_twist
-        linear = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
-        angular = math.sqrt(change[3] ** 2 + change[4] ** 2 + change[5] ** 2)
-        step = self._acceleration_m_s2 * self.period_s
-        largest = max(linear, angular * ROTATION_LEVER_M)
-        if largest <= step:
-            return wanted
-        return self._set_twist + change * (step / largest)
 
 
 class VirtualBench(Clock):
