@@ -84,18 +84,17 @@ def _highest_split(plan: FitPlan, theta: FloatArray) -> tuple[ComplexArray, IntA
     model = plan.model_of(theta)
     poles = model.poles_rad_s()
     heights = np.abs(model.residues_and_sensitivity(poles)[0]) / np.abs(poles.real)
-    split = []
-    for k, of_point in enumerate(poles):
-        above, height = (values[of_point.imag > 0] for values in (of_point, heights[k]))
-        if above.size < 2 or not np.isfinite(height).all():
-            continue
-        highest, least = above[np.argmax(height)], above[np.argmin(height)]
-        moved = np.isin(of_point, [highest, highest.conj(), least, least.conj()])
-        if np.count_nonzero(moved) == 4:
-            pair = highest + np.array([1j, -1j]) * APART * abs(highest.real)
-            of_point[moved] = np.append(pair, pair.conj())
-            split.append(k)
-    return poles, np.array(split, int)
+    above, each = poles.imag > 0, np.arange(len(poles))
+    highest = poles[each, np.where(above, heights, -np.inf).argmax(axis=-1), None]
+    least = poles[each, np.where(above, heights, np.inf).argmin(axis=-1), None]
+    two = np.concatenate([highest, highest.conj(), least, least.conj()], axis=-1)
+    moved = (poles[..., None] == two[:, None]).any(axis=-1)
+    usable = (np.isfinite(heights) | ~above).all(axis=-1) & (above.sum(axis=-1) > 1)
+    split = np.flatnonzero(usable & (moved.sum(axis=-1) == 4))
+    pair = (highest + np.array([1j, -1j]) * APART * np.abs(highest.real))[split]
+    at = split.repeat(4), moved[split].nonzero()[1]
+    poles[at] = np.concatenate([pair, pair.conj()], axis=-1).ravel()
+    return poles, split
 
 
 def _coefficients(plan: FitPlan, data: BinData, poles: ComplexArray) -> FloatArray:
