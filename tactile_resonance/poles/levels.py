@@ -30,6 +30,7 @@ from tactile_resonance.poles.noise_level import (
     CHANCE,
     Pieces,
     at_modes,
+    chance_of_level,
     chance_of_pieces,
     not_counted,
     student_variance,
@@ -82,7 +83,7 @@ def level_of(
     level = solution.part_cost[:, 0] / dof_o
     cost = solution.part_cost[:, 1] / level
     expected = dof_e * dof_o / (dof_o - 1)
-    chance = special.fdtrc(2 * dof_e, 2 * dof_o, cost / dof_e)
+    chance = chance_of_level(cost / dof_e, dof_e, dof_o)
     correction = student_variance(dof)
     if by_piece.any():
         expected = np.where(by_piece, expected * BINS_PER_BAND / (BINS_PER_BAND - 1), expected)

@@ -127,13 +127,23 @@ class VarianceModel:
     def chance(self, cost: FloatArray, parameters: int) -> FloatArray:
         """(batch,) how often noise alone exceeds a cost; NaN where that cannot be determined."""
         free = np.maximum(self.lines - parameters / 2, 0.5)
-        chance = special.fdtrc(2 * free, 2 * self.pooled_dof, cost / free)
+        chance = chance_of_level(cost / free, free, self.pooled_dof)
         by_line = self.kind == 2
         if by_line.any():
             ratio = cost / self.expected_cost(parameters)
             of_lines = chance_of_pieces(ratio, free, 1, self.dof) if self.dof > 2 else np.nan
             chance = np.where(by_line, of_lines, chance)
         return np.asarray(chance)
+
+
+def chance_of_level(ratio: FloatArray, dof: FloatArray, of_level: FloatArray) -> FloatArray:
+    """(batch,) how often noise exceeds a ratio to a level, of complex degrees of freedom each; 1: often.
+
+    That is where it is within a deviation of 1: most points need no distribution.
+    """
+    chance, rare = np.ones(ratio.shape), ~(ratio <= 1 + np.sqrt(1 / dof + 1 / of_level))
+    chance[rare] = special.fdtrc(2 * dof[rare], 2 * of_level[rare], ratio[rare])
+    return chance
 
 
 @np.errstate(invalid="ignore")
