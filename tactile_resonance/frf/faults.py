@@ -391,7 +391,8 @@ def _few_lost(x: _Channel) -> Fault | None:
     edges = np.arange(0, record.size - samples, samples // 8)
     power = np.add.reduceat((record[samples:] - record[:-samples]) ** 2, edges)
     level = np.partition(power, power.size // 4)[power.size // 4]
-    high = np.flatnonzero(power > 3 * level)
+    dof = x.harmonics.size / 4  # of an eighth of a period of noise in their band
+    high = np.flatnonzero(power > level * max(3, special.fdtri(dof, dof, 1 - _FALSE_ALARM / power.size)))
     if not 1 < high.size <= high[-1] - high[0] + 1 <= 9:
         return None
     # the first and the last may differ in part only

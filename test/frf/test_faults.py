@@ -152,6 +152,17 @@ def test_of_a_sensor_alone_a_mode_that_rings_up_is_named_too(multisine):
     assert found
 
 
+@pytest.mark.parametrize("samples", [64, 100, 400])
+def test_noise_over_short_periods_lost_no_samples(samples):
+    """Sums over eighths of a period hold as few independent values as lines."""
+    rng, lines = np.random.default_rng(9), np.arange(max(1, samples // 50), samples // 8)
+    noise = rng.standard_normal((2, 100, 4 * samples))
+    noise[0] = signal.lfilter([1.0], [1.0, -1.9, 0.95], noise[0], axis=-1)
+    u, y = noise.reshape(2, 100, 4, samples)
+    report = find_faults(Spectrum.of(u, y), sample_rate_hz=RATE, harmonics=lines)
+    assert FaultKind.LOST_SAMPLES not in kinds(report)
+
+
 @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
 def test_a_knock_is_no_loss(record, size):
     u, y = record
