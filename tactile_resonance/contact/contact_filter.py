@@ -423,6 +423,10 @@ class ContactFilter:
         """Return the depth of the tip for a force [m]."""
         return hertz_depth(force_n, self.c, self._beam_n_per_m)
 
+    def stiffness_at(self, depth_m: float) -> float:
+        """Return the stiffness at a depth [N/m]."""
+        return hertz_force(depth_m, self.c, self._beam_n_per_m)[1]
+
     def slope_at(self, depth_m: float) -> tuple[float, float]:
         """Return the stiffness at a depth [N/m], and the standard deviation of the force there [N]."""
         _, slope, per_ln_c = hertz_force(depth_m, self.c, self._beam_n_per_m)

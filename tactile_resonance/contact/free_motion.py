@@ -271,7 +271,7 @@ class Withdrawal:
             self._smooth_n, self._felt_s = watch.mean_n, FEEL_NOT_S
         model, touched_m = self._observer.model, self._observer.touched_m
         if model is not None and touched_n > 0:
-            self._n_per_m, _ = model.slope_at(model.depth_for(touched_n))
+            self._n_per_m = model.stiffness_at(model.depth_for(touched_n))
         if self._least_n is None and self._observer.zero is not None:
             if model is not None and touched_m is not None:
                 self._surface_m = max(model.surface_m, touched_m)

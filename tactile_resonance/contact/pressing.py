@@ -239,7 +239,7 @@ class Pressing:
             )
         if holding and speed < 0:
             # stiff tissue is not followed faster than the arm can be stopped in before it is too much
-            slope, _ = model.slope_at(model.depth_for(self._aim.force_n))
+            slope = model.stiffness_at(model.depth_for(self._aim.force_n))
             deepest = min(deepest, self._limits.abort_force_n / 2 / (slope * REACTION_S))
         twist = self._path.along_normal(arm, min(most, max(-deepest, speed)))
         return Move(twist, to)
