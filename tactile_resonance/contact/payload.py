@@ -16,7 +16,7 @@ import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.contact.samples import CellSample, Pose, WrenchSample, new_wrench_sample
+from tactile_resonance.contact.samples import CellSample, Pose, WrenchSample
 from tactile_resonance.contact.vectors import (
     NO_TURN,
     Six,
@@ -255,5 +255,5 @@ class Mounting:
                 d * tx + e * ty + f * tz + (lz * x - lx * z),
                 g * tx + h * ty + i * tz + (lx * y - ly * x),
             )
-            felt.append(new_wrench_sample((time_ns, (x, y, z), torque, overload)))
+            felt.append(WrenchSample(time_ns, (x, y, z), torque, overload))
         return felt

@@ -8,7 +8,7 @@ Numbers are floats in tuples: arithmetic on those of numpy costs a control loop 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
@@ -128,11 +128,6 @@ class WrenchSample(NamedTuple):
     force_n: Vector
     torque_nm: Vector
     overload: bool = False
-
-
-# from a tuple of all fields: what the classes themselves call, at half of the time
-new_cell_sample = partial(tuple.__new__, CellSample)
-new_wrench_sample = partial(tuple.__new__, WrenchSample)
 
 
 class ArmSample(NamedTuple):

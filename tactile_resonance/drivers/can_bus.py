@@ -12,7 +12,7 @@ from binascii import Error as HexError
 from binascii import unhexlify
 from collections import deque
 from concurrent.futures import Future, wait
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import can
@@ -53,10 +53,6 @@ class Frame(NamedTuple):
     data: bytes
     stamp_s: float
     arrival_ns: int
-
-
-# what `Frame` itself calls, at half of the time
-_new_frame = partial(tuple.__new__, Frame)
 
 
 @lru_cache(maxsize=64)  # few on a bus, again and again
@@ -123,13 +119,11 @@ class SocketcandBus:
         found, arrival_ns = _FRAME.findall(received, 0, end), time.monotonic_ns()
         try:
             frames = [
-                _new_frame(
-                    (
-                        _can_id(kind, number),
-                        unhexlify(text.replace(b" ", b"")) if kind == b"frame" else b"",
-                        float(stamp),
-                        arrival_ns,
-                    )
+                Frame(
+                    _can_id(kind, number),
+                    unhexlify(text.replace(b" ", b"")) if kind == b"frame" else b"",
+                    float(stamp),
+                    arrival_ns,
                 )
                 for kind, number, stamp, text in found
             ]

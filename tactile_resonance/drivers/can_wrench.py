@@ -15,7 +15,7 @@ from tactile_resonance.contact.cell_checks import CellChecks
 from tactile_resonance.contact.clocks import STEP_S, ClockTracker
 from tactile_resonance.contact.interfaces import ForceError, ForceFault
 from tactile_resonance.contact.payload import Mounting
-from tactile_resonance.contact.samples import CellSample, new_cell_sample
+from tactile_resonance.contact.samples import CellSample
 from tactile_resonance.drivers.can_bus import (
     ERROR,
     EXTENDED,
@@ -312,7 +312,7 @@ class CanWrench:
             wrench = tuple([sum(map(mul, row, counts)) for row in self._scale])
         overload = self._checks.check(wrench, full_scale)
         self.received += 1
-        return new_cell_sample((self._stamp_ns(stamp_s, arrival_ns), wrench, overload))
+        return CellSample(self._stamp_ns(stamp_s, arrival_ns), wrench, overload)
 
     def _is_of_the_cell(self, frame: Frame) -> bool:
         return frame.can_id in self._ids

@@ -23,7 +23,7 @@ from tactile_resonance.contact.result import Cause, NotIdleError
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.plant.contact_bench import DISH_KG
-from tactile_resonance.simulation.plant.surfaces import FlatSurface
+from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.ur5e.machine import TrackingParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -425,7 +425,7 @@ def test_pressing_is_limited_from_the_touch_on_however_it_is_divided():
         t_s = bench.clock.time_ns * 1e-9
         since_s.setdefault(shaken.controller.state, t_s)
         height_m = 5e-4 + 1e-4 * min(1.0, max(0.0, t_s - 0.5)) * np.sin(6 * np.pi * t_s)
-        bench.plant.surface = FlatSurface.tilted(height_m, 0.0)
+        bench.plant.surface = PlantSurface.tilted(height_m, 0.0)
 
     bench.clock.on_step.append(shake)
     result = shaken.loop.make(shaken.goal)
