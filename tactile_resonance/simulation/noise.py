@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numba import float64, njit
@@ -19,8 +19,8 @@ ROWS = 64
 """Drawn at once: one call costs as much as some hundred numbers, and must not hold up a step."""
 
 
-def normal_rows(seed: Seed, rms: Sequence[float]) -> Iterator[FloatArray]:
-    """Yield rows (width,) of independent normal numbers, without end.
+class NormalRows:
+    """Rows of independent normal numbers, without end.
 
     They are drawn in blocks: a generator that is handed in is ahead of what has been taken.
 
@@ -30,9 +30,18 @@ def normal_rows(seed: Seed, rms: Sequence[float]) -> Iterator[FloatArray]:
     rms : sequence of float
         Standard deviation of each number of a row.
     """
-    random, each = np.random.default_rng(seed), np.array(rms)
-    while True:
-        yield from each * random.standard_normal((ROWS, each.size))
+
+    def __init__(self, seed: Seed, rms: Sequence[float]) -> None:
+        self._random = np.random.default_rng(seed)
+        self._rms = np.array(rms)  # (width,)
+        self._left: list[FloatArray] = []  # the next row last
+
+    def take(self) -> FloatArray:
+        """Return the next row, (width,)."""
+        if not self._left:
+            numbers = self._rms * self._random.standard_normal((ROWS, self._rms.size))
+            self._left = [*reversed(numbers)]
+        return self._left.pop()
 
 
 class Jitter:
@@ -65,19 +74,16 @@ class Jitter:
 
     def reseed(self, seed: Seed) -> None:
         """Let vibration follow from a seed, from the next step on, beginning in a state drawn anew."""
-        random = np.random.default_rng(seed)
-        state = self._rms[:, None] * random.standard_normal((2, 3))  # places and speeds
-        self._places = self._from(state, random)
+        self._random = np.random.default_rng(seed)
+        self._state = self._rms[:, None] * self._random.standard_normal((2, 3))  # places and speeds
+        self._left: list[Vector] = []  # places, the next last
 
     def step(self) -> Vector:
         """Advance one period; return the displacement [m]."""
-        return next(self._places)
-
-    def _from(self, state: FloatArray, random: np.random.Generator) -> Iterator[Vector]:
-        """Place after place, from a block of noise each."""
-        while True:
-            places = _tremble(state, self._by, random.standard_normal((ROWS, 6)))
-            yield from map(tuple, places.tolist())
+        if not self._left:
+            places = _tremble(self._state, self._by, self._random.standard_normal((ROWS, 6)))
+            self._left = [*map(tuple, places[::-1].tolist())]
+        return self._left.pop()
 
 
 @njit(float64[:, ::1](float64[:, ::1], float64[:, ::1], float64[:, ::1]), cache=True)

@@ -23,7 +23,7 @@ from numba.types import UniTuple
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import AboveZero, Checked, NotNegative, read_file, require
-from tactile_resonance.simulation.noise import Seed, normal_rows
+from tactile_resonance.simulation.noise import NormalRows, Seed
 from tactile_resonance.simulation.ur5e.poses import Six
 
 Counts = tuple[int, ...]
@@ -201,7 +201,7 @@ class Transducer:
 
     def reseed(self, seed: Seed) -> None:
         """Take all noise from the next conversion on from a seed, that in the filter's memory too."""
-        self._rows = normal_rows(seed, self._noise_rms)
+        self._rows = NormalRows(seed, self._noise_rms)
         self._noise_begins = True
 
     def set_zero(self, on: bool) -> None:
@@ -225,7 +225,7 @@ class Transducer:
         noise_keep = -1.0 if self._noise_begins else keep
         self._read, self._noise_begins = True, False
         converted: Counts = _convert(
-            *(self._axes, load if before is None else before, load, part, next(self._rows)),
+            *(self._axes, load if before is None else before, load, part, self._rows.take()),
             *(keep, signal_keep, noise_keep, faults.flipped, faults.bias_step_n, faults.stuck),
         )
         if faults.saturated or faults.invalid:

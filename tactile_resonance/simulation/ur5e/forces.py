@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -116,15 +115,17 @@ class FtSensor:
 
     def reseed(self, random: np.random.Generator) -> None:
         """Take all noise from the next step on from a generator, drift drawn anew; the offset stays."""
-        self._errors = self._from(self._drift_rms * random.standard_normal(6), random)
+        self._random = random
+        self._drift = self._drift_rms * random.standard_normal(6)
+        self._errors: list[Six] = []  # what is read beside the truth, that of the next cycle last
 
-    def _from(self, drift: FloatArray, random: np.random.Generator) -> Iterator[Six]:
-        """What is read beside the truth, cycle by cycle: offset, drift and noise."""
-        while True:
-            numbers = self._rms * random.standard_normal((ROWS, 12))
-            drifts = self._keep * (drift + np.cumsum(numbers[:, :6] / self._keep, axis=0))
-            drift = drifts[-1]
-            yield from map(tuple, (self._offset + drifts + numbers[:, 6:]).tolist())
+    def _draw(self) -> None:
+        """Find offset, drift and noise of the next cycles."""
+        numbers = self._rms * self._random.standard_normal((ROWS, 12))
+        drifts = self._keep * (self._drift + np.cumsum(numbers[:, :6] / self._keep, axis=0))
+        self._drift = drifts[-1]
+        errors = self._offset + drifts + numbers[:, 6:]
+        self._errors = [*map(tuple, errors[::-1].tolist())]
 
     def step(self, true: Six, payload_weight: Six, external: Six | None = None) -> None:
         """Measure for one cycle; all wrenches at and in the flange.
@@ -138,7 +139,9 @@ class FtSensor:
         external : 6 floats, optional
             Measured by another sensor, to be used in place of this one's reading.
         """
-        self.raw = total(true, next(self._errors))
+        if not self._errors:
+            self._draw()
+        self.raw = total(true, self._errors.pop())
         self._free = difference(self.raw if external is None else external, payload_weight)
 
     def zero(self) -> None:
