@@ -292,13 +292,13 @@ def _tone_near(
 def _stands_alone(fitted: _Fitted, tone: _Taken) -> bool:
     """Whether little is left around a tone once it is taken off: of a peak of noise or distortion much is.
 
-    Around are bins between lines, and lines where the tone is on one.
+    Around are bins between lines, the nearest four and more, and lines where the tone is on one.
     """
     plan, variance = fitted.plan, fitted.variance
     power = np.sum(np.abs(tone.phasor) ** 2)
     rest = fitted.u if tone.channel == "actuator" else fitted.errors()
     away = np.abs(plan.bins - tone.at)
-    kinds = [(plan.others_at, 4 * BINS_OF_A_TONE)]
+    kinds = [(plan.others_at, 4), (plan.others_at, 4 * BINS_OF_A_TONE)]
     if tone.channel == "sensor" and tone.on_line_of(plan):
         kinds.append((plan.excited_at, 2 * LINES_AROUND))
     for at, count in kinds:
