@@ -24,13 +24,10 @@ import numpy.typing as npt
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.joint_fit import fit_records
 from tactile_resonance.poles.judgement import assemble
 from tactile_resonance.poles.model import PolynomialBasis
 from tactile_resonance.poles.result import PolesBatch
-from tactile_resonance.poles.starts import best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import FitPlan, Problem
 
@@ -284,17 +281,6 @@ class JointPlan(FitPlan):
     def frequency_hz(self) -> FloatArray:
         """(K,) of all bins."""
         return np.asarray(self.bins * self.resolution_hz, float)
-
-    def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
-        """Poles of a fit, in the band or not, and their covariance as its residuals show it."""
-        solution = minimise(self.problem, data)
-        poles, covariance, lost = self.poles_and_covariance(data, solution)
-        rows = np.flatnonzero(lost)
-        if rows.size:  # where noise took a mode, two may be behind the other one
-            part = data.rows(rows)
-            again = best_of_split(self, part, solution.rows(rows))
-            poles[rows], covariance[rows], _ = self.poles_and_covariance(part, again)
-        return poles, covariance
 
     @property
     def _between(self) -> BoolArray:

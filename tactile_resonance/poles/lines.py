@@ -28,7 +28,7 @@ from tactile_resonance.poles.fit import (
 from tactile_resonance.poles.likelihood import Rules, Solution
 from tactile_resonance.poles.model import RationalModel, real_rows
 from tactile_resonance.poles.noise_level import FALSE_ALARM, VarianceModel, at_modes, model_variance
-from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split, exchanged, moved_to
+from tactile_resonance.poles.starts import exchanged, moved_to
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import FitPlan, Problem
 
@@ -356,14 +356,12 @@ class LinesPlan(FitPlan):
         return replace(super().model_of(theta[:, :-1]), delay_s=theta[:, -1] * unit_s, delay_unit_s=unit_s)
 
     def fit(self, data: BinData) -> tuple[LinesPlan, Solution]:
-        """Fit of all points of a batch, and the plan of its coefficients, which may have other bases."""
+        """As `FitPlan.fit`; what that cannot do at full precision."""
         if self.structure.order > LARGEST_BATCHED_ORDER:
             return self.settled(data)._fit_dense(data)
         if self.structure.delay:
             return self._fit_dense(data)
-        solution = minimise(self.problem, data)
-        if self.structure.order >= SEVERAL_MODES:
-            solution = best_of_split(self, data, solution)
+        _, solution = super().fit(data)
         converged, condition = solution.converged, solution.condition
         doubtful = np.flatnonzero(~converged | ~(condition < NORMAL_EQUATIONS_LIMIT))
         if len(data.y) == 1 and doubtful.size:
@@ -380,11 +378,6 @@ class LinesPlan(FitPlan):
             return super().compared(data)
         plan, solution = self.fit(data)
         return plan.poles_in_band(solution.theta[:, 0])
-
-    def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
-        """Poles of a fit, in the band or not, and their covariance as its residuals show it."""
-        plan, solution = self.fit(data)
-        return plan.poles_and_covariance(data, solution)[:2]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def rebased(self, data: BinData) -> LinesPlan:

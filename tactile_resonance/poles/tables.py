@@ -39,12 +39,12 @@ from tactile_resonance.poles.likelihood import (
 )
 from tactile_resonance.poles.model import PolynomialBasis, RationalModel, Variable
 from tactile_resonance.poles.modes import (
-    beside_others,
     modes_in_band,
     pole_quantities,
     second_order,
     significant_modes,
 )
+from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 
 if TYPE_CHECKING:
@@ -347,35 +347,27 @@ class FitPlan(ABC):
         """Poles (points, places) of a fit of few iterations that others are compared with."""
         return self.poles_in_band(minimise(self.problem, data, start, COMPARISON).theta[:, 0])
 
-    @abstractmethod
+    def fit(self, data: BinData) -> tuple[Self, Solution]:
+        """Fit of all points of a batch, and the plan of its coefficients, which may have other bases."""
+        solution = minimise(self.problem, data)
+        if self.structure.order >= SEVERAL_MODES:
+            solution = best_of_split(self, data, solution)
+        return self, solution
+
     def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
-        """Poles of a fit, in the band or not, and their covariance as its residuals show it."""
+        """Poles (points, places) of a fit, in the band or not, and their covariance as its residuals show it.
 
-    def poles_and_covariance(
-        self, data: BinData, solution: Solution
-    ) -> tuple[ComplexArray, FloatArray, BoolArray]:
-        """Poles of a solution, in the band or not, and their covariance as its residuals show it.
-
-        Returns
-        -------
-        poles : (points, places) complex
-        covariance : (points, places, 2, 2) float
-            Of (f0_hz, damping_ratio); NaN where the data do not determine the mode.
-        lost : (points,) bool
-            Where a mode is none, or noise makes it and it is not beside another one.
+        That is (points, places, 2, 2) of (f0_hz, damping_ratio); NaN where the data do not determine the mode.
         """
-        own, n = self.problem.sizes[2], solution.theta.shape[-1]
+        plan, solution = self.fit(data)
+        own, n = plan.problem.sizes[2], solution.theta.shape[-1]
         free = data.records * own + n - own
         dof = max(data.records * data.order.size - free / 2, 1)
         covariance = solution.marginal[:, 0] * (solution.cost / (2 * dof))[:, None, None]
-        model = self.model_of(solution.theta[:, 0])
+        model = plan.model_of(solution.theta[:, 0])
         quantities, _ = pole_quantities(model, (0.0, np.inf), covariance)
-        poles = quantities["poles_rad_s"]
+        poles, in_f0 = quantities["poles_rad_s"], quantities["covariance"]
         lines = np.full(solution.cost.size, int(dof))
-        found, distance = significant_modes(model, quantities, covariance, lines)
-        in_f0 = quantities["covariance"]
+        _, distance = significant_modes(model, quantities, covariance, lines)
         in_f0[~((np.linalg.det(in_f0) > 0) & (in_f0[..., 0, 0] > 0))] = np.nan  # lost to rounding
-        more = second_order(poles, np.isfinite(poles), distance)
-        lost = np.asarray((~found & ~beside_others(poles, found)).any(axis=-1))
-        return poles, in_f0 + more, lost
-
+        return poles, in_f0 + second_order(poles, np.isfinite(poles), distance)
