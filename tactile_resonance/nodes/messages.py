@@ -225,7 +225,7 @@ def _bins(message: msg.FRF) -> tuple[BandBins, ...]:
     ends = np.cumsum(counts)[:-1] * records
     u, y = (np.split(complex_of(message, f"bins_{c}_"), ends) for c in ("actuator", "sensor"))
     # a line where two bands touch came with both
-    harmonics = np.unique(array_of(message.bins_harmonics).astype(np.int64))
+    harmonics = np.array(sorted({*message.bins_harmonics}), np.int64)
     bins = harmonics * message.bins_periods
     return tuple(
         BandBins(

@@ -182,7 +182,7 @@ def poles_without_tones(
     lost = fitted.batch.has_status(PolesStatus.NOT_CONVERGED) and not whole.batch.has_status(
         PolesStatus.NOT_CONVERGED
     )
-    if lost or _lines_in_a_row(fitted.plan):
+    if lost or (taken and _lines_in_a_row(fitted.plan)):
         return whole.batch, ()
     named = (tone.named(fitted.plan) for tone in sorted(taken, key=lambda tone: tone.at))
     return fitted.batch, tuple(named)
