@@ -73,8 +73,8 @@ def falls_without_each(
     whole = np.concatenate([of_shared, np.broadcast_to(of_own, (records, *of_own.shape))], axis=-1)
     q = whole.reshape(records, bins, 2, whole.shape[-1])
     # (I - H) of each bin, 2 x 2: what of an error there the fit has left
-    of_re, of_im = q[..., 0, :], q[..., 1, :]
-    p, r, b = 1 - np.vecdot(of_re, of_re), 1 - np.vecdot(of_im, of_im), -np.vecdot(of_re, of_im)
+    left = np.eye(2) - q @ q.swapaxes(-1, -2)
+    p, r, b = left[..., 0, 0], left[..., 1, 1], left[..., 0, 1]
     re, im = error.real, error.imag
     falls = (r * re**2 - 2 * b * re * im + p * im**2) / (p * r - b**2)
     least = (p + r) / 2 - np.hypot((p - r) / 2, b)  # eigenvalue
