@@ -373,8 +373,7 @@ def lost_samples(x: _Channel) -> Fault | None:
         return None
     worst = int(shift[np.argmax(np.abs(shift))])
     text = f"Periods of the {x.name} are shifted by {worst} samples: some were lost in between"
-    if x.name == "sensor":  # turns neighbouring lines alike
-        text += ", or a mode rings through them"
+    text += ", or a mode rings through them" if x.name == "sensor" else ""
     return x.fault(FaultKind.LOST_SAMPLES, abs(worst), True, text)
 
 
@@ -393,7 +392,8 @@ def _few_lost(x: _Channel) -> Fault | None:
     level = np.partition(power, power.size // 4)[power.size // 4]
     dof = x.harmonics.size / 4  # of an eighth of a period of noise in their band
     high = np.flatnonzero(power > level * max(3, special.fdtri(dof, dof, 1 - _FALSE_ALARM / power.size)))
-    if not 1 < high.size <= high[-1] - high[0] + 1 <= 9:
+    # of a sensor what differs from the start on decays, as a mode from rest
+    if not 1 < high.size <= high[-1] - high[0] + 1 <= 9 or start > high[0]:
         return None
     # the first and the last may differ in part only
     inner = high[1:-1] if high.size > 2 else high

@@ -163,6 +163,18 @@ def test_noise_over_short_periods_lost_no_samples(samples):
     assert FaultKind.LOST_SAMPLES not in kinds(report)
 
 
+def test_what_decays_from_rest_is_no_loss(multisine):
+    rng, lines = np.random.default_rng(10), np.arange(40, 150)
+    for f0_hz in np.linspace(190, 210, 12):
+        u = np.tile(multisine(lines, 2000, rng, amplitude=0.1), 8)
+        pole = np.exp(2 * np.pi * (-5e-4 + 1j) * f0_hz / 5e3)
+        y = signal.lfilter([1 - abs(pole)], [1, -2 * pole.real, abs(pole) ** 2], u)
+        y += 0.1 * y.std() / u.std() * u + 1e-3 * y.std() * rng.standard_normal(y.size)
+        record = Spectrum.of(u.reshape(8, -1), y.reshape(8, -1))
+        report = find_faults(record, sample_rate_hz=5e3, harmonics=lines)
+        assert FaultKind.LOST_SAMPLES not in kinds(report), report.message
+
+
 @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
 def test_a_knock_is_no_loss(record, size):
     u, y = record
