@@ -315,7 +315,7 @@ def noting_signals() -> Iterator[Callable[[], None]]:
     finally:
         for number in ENDING:
             signal.signal(number, signal.default_int_handler)
-    check()
+        check()  # also where an error ends what was under way
 
 
 def node_parameters(

@@ -84,6 +84,7 @@ def test_an_interrupted_scan_says_how_to_go_on_and_its_folder_is_taken(domain, t
     demo, run = start(tmp_path, domain), tmp_path / "run"
     deadline = time.monotonic() + HANGS_S
     while not (run / "run.json").exists() and time.monotonic() < deadline:
+        assert demo.poll() is None, f"ended with {demo.returncode}: {demo.communicate()}"
         time.sleep(0.05)
     errors = interrupt(demo, signal.SIGINT, domain)
     command = os.environ.get("TACTILE_RESONANCE_COMMAND", "tactile_resonance")

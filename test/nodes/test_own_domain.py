@@ -3,6 +3,7 @@
 
 import contextlib
 import errno
+import signal
 from types import SimpleNamespace
 
 import pytest
@@ -18,7 +19,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes import client as client_module
 from tactile_resonance.nodes.client import ScanClient
 from tactile_resonance.nodes.running import initialised
-from tactile_resonance.processes import domain_is_free, free_domain_id
+from tactile_resonance.processes import ENDING, domain_is_free, free_domain_id
 
 
 @pytest.mark.parametrize(
@@ -119,3 +120,18 @@ def test_silence_counts_only_while_this_process_runs(monkeypatch):
     assert after(3600.0, 1) == 1.5  # stopped meanwhile, as by Ctrl-Z
     assert after(0.5, 2) == 0
     assert after(0.5, 2) == 0.5
+
+
+def test_an_interrupt_counts_also_where_an_error_ends_what_was_under_way():
+    def session():
+        with bench_scan.noting_signals():
+            signal.raise_signal(signal.SIGINT)
+            raise RuntimeError("scan_node ended")
+
+    before = {number: signal.getsignal(number) for number in ENDING}
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            session()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
