@@ -2,6 +2,8 @@
 """The examples of the client's page, run as they stand there, on the bench with ideal contact."""
 
 import os
+import runpy
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +17,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from rosbags.highlevel import AnyReader
 
 from tactile_resonance.contact.samples import Pose
+from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
@@ -83,3 +86,24 @@ def test_the_example_scans_its_poses_and_steers_the_scan(domain, tmp_path):
             x, y, z = table_in_base.rotation.inv().apply(at)
             assert min(abs(x - place) for place in places) < 1e-9
             assert (y, z) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_the_bench_takes_the_arguments_of_the_launch_file_or_refuses_them(tmp_path, monkeypatch):
+    """One that it passed over would leave the default in force without a word."""
+    (tmp_path / "mine.yaml").write_text("/**/poles_node: {ros__parameters: {order: 4}}")
+    told = {}
+
+    def bring_up(_, nodes, parameters):
+        told.update(parameters)
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(NodeProcesses, "bring_up", bring_up)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(sys, "argv", [str(BENCH), "robot:=ideal", "params_file:=mine.yaml"])
+    runpy.run_path(str(BENCH))
+    assert told["poles_node"]["order"] == 4
+    assert told["fake_hardware_node"]["serve_contact"] is True
+    monkeypatch.setattr(sys, "argv", [str(BENCH), "namespace:=left"])
+    with pytest.raises(SystemExit, match=r"^namespace: not among "):
+        runpy.run_path(str(BENCH))
