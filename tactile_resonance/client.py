@@ -141,7 +141,7 @@ class AskedGoal:
         far = f"{self.heard.finished} of {self.heard.points} points were finished"
         text = f"{why}, {far}; the run can be resumed"
         unknown = dict.fromkeys(("done", "failed", "skipped"))
-        return self.kind(Ending.LOST, text, run_directory=run, **unknown)
+        return self.kind(Ending.LOST, text, run_directory=run, points=self.heard.points, **unknown)
 
     def outcome(self, answer: Any) -> Any:
         """Outcome of the answer to the goal's result."""

@@ -61,7 +61,7 @@ class ScanRequest(ScanClient):
             del goal["scene"]  # that of the run
         (wait_s,) = values(self._node, "start_within_s")
         outcome = self.scan(**goal, on_feedback=self._tell, wait_s=wait_s)
-        if not outcome.points:
+        if not outcome.points or outcome.done is None:
             states = sorted(self.states.items())
             down = "; ".join(f"{name}: {state}" for name, state in states if not state.startswith("active"))
             raise NoAnswer(f"{outcome.ending.value}: {outcome.message}{f' ({down})' if down else ''}")

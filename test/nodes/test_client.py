@@ -358,6 +358,7 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     far = f"{heard[-1].finished} of {heard[-1].points} points were finished"
     assert outcome.message == f"scan_node went away, {far}; the run can be resumed"
     assert (outcome.done, outcome.failed, outcome.skipped) == (None, None, None)
+    assert outcome.points == heard[-1].points
 
 
 @pytest.mark.parametrize("kind", [ScanOutcome, CalibrationOutcome])
