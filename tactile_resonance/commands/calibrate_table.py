@@ -82,7 +82,8 @@ def run(options: argparse.Namespace) -> int:
         with tempfile.TemporaryDirectory() as work:
             outcome = _simulated(options.robot_host, Path(work), xys, options.height_m, wanted)
     else:
-        outcome = ask(xys, options.height_m, wanted, namespace=options.namespace)
+        with noting_signals() as check:
+            outcome = ask(xys, options.height_m, wanted, check, options.namespace)
     print(report(xys, outcome, TRUTH if options.simulated else None))
     if options.output is not None and not outcome.file:
         raise ValueError(f"calibrate-table: {outcome.message}")
@@ -101,10 +102,10 @@ def ask(
     xys: Sequence[Sequence[float]],
     height_m: float,
     wanted: dict[str, Any],
-    check_nodes: Callable[[], None] | None = None,
-    namespace: str = "",
+    check: Callable[[], None],
+    namespace: str | None = None,
 ) -> CalibrationOutcome:
-    """Outcome of a calibration by a scan_node that runs, or by nodes that were started and are checked."""
+    """Outcome of a calibration by a scan_node that runs in a namespace, or by nodes that were started."""
     require_packages("rclpy", "tactile_resonance.msg")
     # only here: the command answers --help without ROS
     from geometry_msgs.msg import Point
@@ -125,8 +126,8 @@ def ask(
         )
 
     points = [Point(x=x, y=y, z=height_m) for x, y in xys]
-    with ScanClient(check_nodes or (lambda: None), namespace=namespace) as client:
-        if check_nodes is not None:
+    with ScanClient(check, namespace=namespace or "") as client:
+        if namespace is None:
             client.wait_until_up(START_WITHIN_S)
         outcome = client.calibrate_table(
             WITHIN_S, points=points, **wanted, on_feedback=tell, wait_s=NODE_WITHIN_S

@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import threading
 
+from tactile_resonance.commands.bench_scan import noting_signals
 from tactile_resonance.commands.options import add_option, require_packages
 from tactile_resonance.fields import require
-from tactile_resonance.processes import ENDING
 
 PORT = 8765
 EACH_S = 0.2
@@ -45,8 +44,6 @@ def run(options: argparse.Namespace) -> int:
         require(not error, "--namespace", options.namespace, accepted)
     from tactile_resonance.nodes.client import LiveListener
 
-    for number in ENDING:  # also where a shell began it in the background, interrupts ignored
-        signal.signal(number, signal.default_int_handler)
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     live = LiveRun(lambda name, data: server.publish(name, data))
     server = LiveServer(options.port, live.snapshot)
@@ -60,13 +57,14 @@ def run(options: argparse.Namespace) -> int:
         except Exception as error:  # raised again below: a page that stands still would seem to be live
             failed.append(error)
 
-    with server, LiveListener(live, options.namespace) as listener:
+    with noting_signals() as check, server, LiveListener(live, options.namespace) as listener:
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         print(f"{server.url} shows the nodes of ROS_DOMAIN_ID={domain}; Ctrl-C ends it", flush=True)
         threading.Thread(target=tick, daemon=True).start()
         try:
             while not failed:
-                listener.spin(1.0)
+                check()
+                listener.spin(EACH_S)
             raise failed[0]
         finally:
             ended.set()

@@ -13,6 +13,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 import rclpy
 
+from tactile_resonance import cli
 from tactile_resonance.commands import bench_scan
 from tactile_resonance.commands.bench_scan import Silence, require_own_domain
 from tactile_resonance.configuration import share_path
@@ -122,16 +123,42 @@ def test_silence_counts_only_while_this_process_runs(monkeypatch):
     assert after(0.5, 2) == 0.5
 
 
-def test_an_interrupt_counts_also_where_an_error_ends_what_was_under_way():
+@pytest.fixture
+def handlers():
+    """Of signals: as they were, afterwards."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_an_interrupt_counts_also_where_an_error_ends_what_was_under_way(handlers):
     def session():
         with bench_scan.noting_signals():
             signal.raise_signal(signal.SIGINT)
             raise RuntimeError("scan_node ended")
 
-    before = {number: signal.getsignal(number) for number in ENDING}
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            session()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with pytest.raises(KeyboardInterrupt):
+        session()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["live", "--port", "0"], ["calibrate-table", "--points", "[[0, 0], [0.01, 0], [0, 0.01]]"]],
+    ids=["live", "calibrate-table"],
+)
+def test_an_interrupt_that_meets_rclpy_at_work_takes_effect_after_it(monkeypatch, handlers, command):
+    """Raised as a message is taken it becomes a RuntimeError: a traceback, and no tip that is drawn back."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain_id({})))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    spin, finished = client_module.NodeClient.spin, []
+
+    def interrupted(self, seconds):
+        if not finished:
+            signal.raise_signal(signal.SIGINT)
+            finished.append(seconds)
+        spin(self, seconds)
+
+    monkeypatch.setattr(client_module.NodeClient, "spin", interrupted)
+    assert cli.main(command) == 130
+    assert finished
