@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +123,31 @@ class NodeProcesses:
         deadline = time.monotonic() + GRACE_S
         while any(map(_runs, orphans)) and time.monotonic() < deadline:
             time.sleep(ORPHAN_POLL_S)
+
+
+@contextlib.contextmanager
+def noting_signals() -> Iterator[Callable[[], None]]:
+    """`ENDING` signals take effect only where what it gives is called, and at its end.
+
+    So what is under way ends in order, also where a shell made this process ignore Ctrl-C. What it gives raises
+    `KeyboardInterrupt` once for all that have come, so that this end may be waited for; later each interrupts
+    at once.
+    """
+    come: list[int] = []
+    for number in ENDING:
+        signal.signal(number, lambda number, _: come.append(number))
+
+    def check() -> None:
+        if come:
+            come.clear()
+            raise KeyboardInterrupt
+
+    try:
+        yield check
+    finally:
+        for number in ENDING:
+            signal.signal(number, signal.default_int_handler)
+        check()  # also where an error ends what was under way
 
 
 def free_domain_id(environment: Mapping[str, str] = os.environ) -> int:

@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import shutil
-import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,11 +19,11 @@ from tactile_resonance.calibration.model import read_calibration
 from tactile_resonance.commands.options import ProgressBar, add_option, require_packages
 from tactile_resonance.fields import counted, require
 from tactile_resonance.processes import (
-    ENDING,
     NodeProcesses,
     domain_is_free,
     free_domain_id,
     may_take_priority,
+    noting_signals,
 )
 from tactile_resonance.simulation.plant.defaults import PRIORITY
 
@@ -292,30 +290,6 @@ def require_own_domain() -> None:
                 f"ROS_DOMAIN_ID: {domain} has {', '.join(found)} of another session; accepted is a domain "
                 "without them, unset it and one is taken"
             )
-
-
-@contextlib.contextmanager
-def noting_signals() -> Iterator[Callable[[], None]]:
-    """`ENDING` signals take effect only where what it gives is called, and at its end: they end nodes in order.
-
-    Even where a shell made this process ignore Ctrl-C. What it gives raises `KeyboardInterrupt` once for all
-    that have come, so that the end of what is under way may be waited for; later each interrupts at once.
-    """
-    come: list[int] = []
-    for number in ENDING:
-        signal.signal(number, lambda number, _: come.append(number))
-
-    def check() -> None:
-        if come:
-            come.clear()
-            raise KeyboardInterrupt
-
-    try:
-        yield check
-    finally:
-        for number in ENDING:
-            signal.signal(number, signal.default_int_handler)
-        check()  # also where an error ends what was under way
 
 
 def node_parameters(

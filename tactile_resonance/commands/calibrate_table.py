@@ -17,12 +17,11 @@ from tactile_resonance.commands.bench_scan import (
     Job,
     add_robot_host,
     node_parameters,
-    noting_signals,
     take_domain,
 )
 from tactile_resonance.commands.options import add_option, require_packages
 from tactile_resonance.fields import read
-from tactile_resonance.processes import NodeProcesses
+from tactile_resonance.processes import NodeProcesses, noting_signals
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 from tactile_resonance.strict_yaml import parse_yaml
 

@@ -7,9 +7,9 @@ import argparse
 import os
 import threading
 
-from tactile_resonance.commands.bench_scan import noting_signals
 from tactile_resonance.commands.options import add_option, require_packages
 from tactile_resonance.fields import require
+from tactile_resonance.processes import noting_signals
 
 PORT = 8765
 EACH_S = 0.2

@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-
-from rclpy.executors import ExternalShutdownException
+from collections.abc import Callable
 
 from tactile_resonance.action import Scan
 from tactile_resonance.client import Ending, ScanOutcome
 from tactile_resonance.nodes.client import NoAnswer, ScanClient
 from tactile_resonance.nodes.parameters import Fixed, declare, values
+from tactile_resonance.processes import noting_signals
 
 PARAMETERS = (
     Fixed(
@@ -44,8 +43,8 @@ QUIET = (
 class ScanRequest(ScanClient):
     """A node of that name with the goal's fields as parameters."""
 
-    def __init__(self) -> None:
-        super().__init__(lambda: None, "scan_goal")
+    def __init__(self, check: Callable[[], None]) -> None:
+        super().__init__(check, "scan_goal")
         self._said = ""
 
     def join(self) -> None:
@@ -89,12 +88,11 @@ class ScanRequest(ScanClient):
 
 def main() -> None:
     """Console script: 0 where every point of the plan is finished."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with ScanRequest() as client:
+        with noting_signals() as check, ScanRequest(check) as client:
             outcome = client.run()
         sys.exit(0 if outcome.ending is Ending.COMPLETE else 1)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         sys.exit(130)  # the scan goes on without it
     except (NoAnswer, ValueError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)

@@ -19,13 +19,13 @@ from tactile_resonance.msg import ContactState
 from tactile_resonance.bringup import plan_bringup
 from tactile_resonance.cli import main
 from tactile_resonance.client import Ending
-from tactile_resonance.commands.bench_scan import Job, node_parameters, noting_signals
+from tactile_resonance.commands.bench_scan import Job, node_parameters
 from tactile_resonance.commands.calibrate_table import NODES, SIMULATED_POINTS, TRUTH, true_table
 from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.nodes.scan_node import RUNNING
-from tactile_resonance.processes import ENDING, NodeProcesses
+from tactile_resonance.processes import ENDING, NodeProcesses, noting_signals
 from tactile_resonance.scan.table_calibration import read_table
 
 SCENE = share_path("config/scenes/inclusion_scan.yaml")

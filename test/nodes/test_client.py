@@ -464,7 +464,7 @@ def test_scan_goal_needs_no_manager(stack, monkeypatch, tmp_path):
     spinning = threading.Thread(target=stack.own.spin)
     spinning.start()
     try:
-        with scan_goal.ScanRequest() as request, pytest.raises(NoAnswer) as ended:
+        with scan_goal.ScanRequest(lambda: None) as request, pytest.raises(NoAnswer) as ended:
             request.run()
     finally:
         stack.own.shutdown()

@@ -20,7 +20,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes import client as client_module
 from tactile_resonance.nodes.client import ScanClient
 from tactile_resonance.nodes.running import initialised
-from tactile_resonance.processes import ENDING, domain_is_free, free_domain_id
+from tactile_resonance.processes import ENDING, domain_is_free, free_domain_id, noting_signals
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def handlers():
 
 def test_an_interrupt_counts_also_where_an_error_ends_what_was_under_way(handlers):
     def session():
-        with bench_scan.noting_signals():
+        with noting_signals():
             signal.raise_signal(signal.SIGINT)
             raise RuntimeError("scan_node ended")
 
