@@ -7,6 +7,7 @@ The true poles there are on the topic `bench/truth` and behind the service `benc
 
 from __future__ import annotations
 
+import os
 import select
 import subprocess
 import sys
@@ -94,22 +95,21 @@ class PlantChild:
             *(str(float(value)) for value in table_in_base),
             *(["--simulated-time"] if simulated_time else pace),
         ]
-        self._process = start_child(command, stdout=subprocess.PIPE, text=True)
+        self._process = start_child(command, stdout=subprocess.PIPE)
         assert self._process.stdout is not None
-        deadline = time.monotonic() + START_WITHIN_S
-        said = []
+        out, said, deadline = self._process.stdout.fileno(), "", time.monotonic() + START_WITHIN_S
         while time.monotonic() < deadline:
-            ready, _, _ = select.select([self._process.stdout], [], [], 0.1)
-            line = self._process.stdout.readline() if ready else ""
-            if line.startswith(READY):
-                return
-            if line.strip():
-                said.append(line.strip())
-            elif self._process.poll() is not None:
+            if not select.select([out], [], [], 0.1)[0]:
+                continue
+            read = os.read(out, 1 << 16)  # all lines that have come: select sees none that a reader holds back
+            if not read:  # it has ended
                 break
+            said += read.decode(errors="replace")
+            if any(line.startswith(READY) for line in said.splitlines()):
+                return
         self.close()
         raise ValueError(
-            f"robot_host: no simulated robot at {host}: {' '.join(said) or 'no output'}"
+            f"robot_host: no simulated robot at {host}: {' '.join(said.split()) or 'no output'}"
         )
 
     @property

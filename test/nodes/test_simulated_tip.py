@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The truth of a contact that creeps is the mean over the record, as an estimate has it."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 
 from geometry_msgs.msg import PoseStamped
 
-from tactile_resonance.nodes.simulated_tip import truth_message
+from tactile_resonance.nodes import simulated_tip
+from tactile_resonance.nodes.simulated_tip import PlantChild, truth_message
+from tactile_resonance.processes import start_child
+from tactile_resonance.simulation.plant.defaults import READY
 from tactile_resonance.simulation.sensor.bench import BenchTip, SimulatedBench
 from tactile_resonance.simulation.tissue.library import read_tissues
 
@@ -31,3 +36,26 @@ def test_truth_of_a_contact_that_changes_is_its_mean():
     modes = tip.coupled(bench).modes
     np.testing.assert_allclose(now.f0_hz, [mode.f0_hz for mode in modes])
     assert now.contact_force_n == 0.01
+
+
+def robot_that_says(text, monkeypatch):
+    """What a simulated robot is to its node that prints a text at once and stays for a while, or ends."""
+    program = f"import os, time; os.write(1, {text.encode()!r}); time.sleep({60 if READY in text else 0})"
+
+    def start(_, **options):
+        return start_child([sys.executable, "-c", program], **options)
+
+    monkeypatch.setattr(simulated_tip, "start_child", start)
+    return PlantChild("127.0.1.1", Path("scene.yaml"), [0.0] * 6, 1, simulated_time=True)
+
+
+def test_a_robot_that_says_more_than_that_it_is_ready_is_ready(monkeypatch):
+    monkeypatch.setattr(simulated_tip, "START_WITHIN_S", 30.0)
+    child = robot_that_says(f"a warning\n{READY} 127.0.1.1\n", monkeypatch)
+    assert child.alive
+    child.close()
+
+
+def test_what_a_robot_said_that_ended_is_named(monkeypatch):
+    with pytest.raises(ValueError, match=r"no simulated robot at 127.0.1.1: port 30004 is taken"):
+        robot_that_says("port 30004\nis taken\n", monkeypatch)
