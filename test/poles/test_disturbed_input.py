@@ -89,16 +89,25 @@ def test_noise_of_the_voltmeter_beside_a_disturbance():
     assert stats.binom.cdf(inside, 40, 0.95) > 1e-3  # 27 of 40 with alike weights
 
 
+def distances(runs, periods, **noise):
+    """(runs,) the same of records with white noise."""
+    u, y = np.swapaxes([record(seed, kind="white", periods=periods, **noise) for seed in range(runs)], 0, 1)
+    found = JointPlan(RATE_HZ, SAMPLES, periods, ODD, BAND_HZ, ModelStructure())(u, y)
+    error = np.stack([found.f0_hz[:, 0] - F0_HZ, found.damping_ratio[:, 0] - DAMPING_RATIO], -1)
+    return np.sum(error * np.linalg.solve(found.covariance[:, 0], error[..., None])[..., 0], -1)
+
+
 def test_noise_of_the_voltmeter_counts_most_at_the_resonance():
     """A weak disturbance is known input, but for the voltmeter's noise, which comes in through the response."""
-    noise = {"kind": "white", "generator": 0.03, "voltmeter_u": 3e-3, "noise_y": 3e-3, "periods": 4}
-    u, y = np.swapaxes([record(seed, **noise) for seed in range(600)], 0, 1)
-    plan = JointPlan(RATE_HZ, SAMPLES, 4, ODD, BAND_HZ, ModelStructure())
-    found = plan(u, y)
-    error = np.stack([found.f0_hz[:, 0] - F0_HZ, found.damping_ratio[:, 0] - DAMPING_RATIO], -1)
-    squared = np.sum(error * np.linalg.solve(found.covariance[:, 0], error[..., None])[..., 0], -1)
+    squared = distances(600, 4, generator=0.03, voltmeter_u=3e-3, noise_y=3e-3)
     outside = np.count_nonzero(squared > stats.chi2.isf(0.05, 2))
     assert stats.binom.sf(outside - 1, squared.size, 0.05) > 1e-3
+
+
+def test_ellipses_beside_a_disturbance_far_above_the_noise_are_no_wider_than_errors():
+    """Start values take it for noise, which hides how little there is: squares were 1.1 in place of 2."""
+    squared = distances(300, 2, generator=0.3)
+    assert stats.chi2.cdf(squared.sum(), 600) > 1e-3
 
 
 @pytest.mark.parametrize("apart", [1.5e-6, 1.5e-5, 1.5e-4])

@@ -342,6 +342,7 @@ def test_leading_axes_samples_and_nan():
     plan = plan_of(2)
     batch = plan.from_bins(u.reshape(2, 3, 2, -1), y.reshape(2, 3, 2, -1))
     assert batch.shape == (2, 3)
+    assert plan.from_bins(u[:0], y[:0]).f0_hz.shape == (0, 1)
     assert plan.from_bins(u[4], y[4]).f0_hz == pytest.approx(batch.f0_hz[1, 1], rel=1e-9)
     y[1, 1, 7] = np.nan
     result = plan.from_bins(u, y)
