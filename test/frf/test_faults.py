@@ -183,6 +183,18 @@ def test_a_knock_is_no_loss(record, size):
     assert FaultKind.LOST_SAMPLES not in kinds(check(u, y + knock.reshape(y.shape)))
 
 
+def test_a_burst_of_noise_is_no_loss(multisine):
+    """By chance some shift takes off a little of it."""
+    rng, lines = np.random.default_rng(6), np.arange(16, 80)
+    for _ in range(30):
+        u = np.tile(multisine(lines, 2000, rng, amplitude=0.1), 4)
+        y = 0.5 * np.roll(u, 3) + 1e-3 * rng.standard_normal(u.size)
+        y[6600:7100] += 4 * y.std() * rng.standard_normal(500)
+        record = Spectrum.of(u.reshape(4, -1), y.reshape(4, -1))
+        report = find_faults(record, sample_rate_hz=5e3, harmonics=lines)
+        assert FaultKind.LOST_SAMPLES not in kinds(report)
+
+
 @pytest.mark.parametrize("lines", [LINES, LINES[:5]])
 def test_noise_is_not_taken_for_lost_samples_and_lost_samples_are_seen_through_it(multisine, lines):
     rng = np.random.default_rng(5)
@@ -311,7 +323,7 @@ def test_a_resonance_that_starts_from_rest_is_no_hum(periods, multisine):
     assert FaultKind.HUM not in kinds(report)
 
 
-@pytest.mark.parametrize("f0_hz", [45.3, 54.1, 56.7, 63.2, 65.0, 114.0, 144.5])
+@pytest.mark.parametrize("f0_hz", [45.3, 54.1, 56.7, 58.7, 63.2, 65.0, 114.0, 144.5])
 @pytest.mark.parametrize("periods", [1, 2, 4])
 def test_a_mode_that_rings_beside_the_mains_is_no_hum(f0_hz, periods, multisine):
     """From rest: before, hum at 50 or 60 Hz in all records of modes that near."""
