@@ -135,7 +135,7 @@ class ForceWatch:
 
     @property
     def newest_n(self) -> float:
-        """Mean of the three newest forces along z, less the bias [N]; of as many as there are since."""
+        """Mean of the three newest forces along z [N]; of fewer where so many have not come."""
         forces = list(self._forces_n)[-3:]
         return sum(forces) / max(1, len(forces))
 

@@ -223,8 +223,8 @@ class Limits:
     hard_force_n: float = within(0.05, 1e-3, 20.0, "Force that must never be reached [N].")
     pull_force_n: float = within(
         *(0.008, 1e-3, 10.0),
-        "Force against the pressing direction at which the contact is given up [N]: a sensor "
-        "with its sign flipped, or a tip that sticks.",
+        "Force against the pressing direction, mean of three, at which the contact is given up [N]: "
+        "a sensor with its sign flipped, or a tip that sticks.",
     )
     lateral_force_n: float = within(0.015, 1e-3, 10.0, "Along the surface [N].")
     force_rate_n_per_s: float = within(1.2, 0.01, 1000.0, "Over 10 ms [N/s].")
@@ -245,7 +245,7 @@ class Limits:
     angular_speed_rad_s: float = within(0.3, 0.0, 2.0, "Of turns anywhere [rad/s].")
     tilt_rad: float = within(0.8, 1e-3, 1.6, "Between +z of the tip and that of the base [rad].")
     misalignment_rad: float = within(
-        0.05, 1e-3, 0.5, "Between the tip and its goal while near the surface [rad]."
+        0.05, 1e-3, 0.5, "Between the tip and its goal, near the surface and in contact [rad]."
     )
     clearance_m: float = within(
         1e-4, 0.0, 0.05, "Of the sensor's housing above the surface, at least [m]."

@@ -43,9 +43,8 @@ from tactile_resonance.fields import (
     require,
 )
 
-LONGEST_S = 1.0
-Delay = Annotated[float, Range(0.0, LONGEST_S)]
-"""Of delays: with more, no contact is controlled."""
+Delay = Annotated[float, Range(0.0, 1.0)]
+"""With more [s], no contact is controlled."""
 
 
 def _read_bus(value: object, where: str) -> dict[str, Any]:

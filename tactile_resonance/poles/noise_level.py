@@ -137,9 +137,9 @@ class VarianceModel:
 
 
 def chance_of_level(ratio: FloatArray, dof: FloatArray, of_level: FloatArray) -> FloatArray:
-    """(batch,) how often noise exceeds a ratio to a level, of complex degrees of freedom each; 1: often.
+    """(batch,) how often noise exceeds a ratio to a level, of so many complex degrees of freedom each.
 
-    That is where it is within a deviation of 1: most points need no distribution.
+    1 up to a deviation above 1, which noise exceeds more often than any test asks for.
     """
     chance, rare = np.ones(ratio.shape), ~(ratio <= 1 + np.sqrt(1 / dof + 1 / of_level))
     chance[rare] = special.fdtrc(2 * dof[rare], 2 * of_level[rare], ratio[rare])

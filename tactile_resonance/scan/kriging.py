@@ -39,7 +39,7 @@ _BLOCK = 40
 MOST_JOINT = 1000
 _NEIGHBOURS, _ALONG = 300, 12  # of a tile; tiles along the longer side
 MIXED_POINTS = 40
-"""Up to so many places the uncertainty of length, size and scatter counts: of more it adds little."""
+"""Up to so many places, and up to `FIT_POINTS` values, length, size and scatter count as uncertain."""
 # Of the mixture: steps of the logarithms of length and size; sizes in standard deviations of theirs; least
 # share of the largest; scatters over that of the values.
 _LENGTH_STEP, _SIZE_STEP, _SIZE_STEPS, _LEAST_SHARE = 0.7, 0.25, (-1.3, 0, 1.3, 2.6), 0.1
