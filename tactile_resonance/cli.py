@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import NoReturn
 
-from tactile_resonance.processes import ENDING
+from tactile_resonance.processes import ENDING, keep_memory
 
 COMMANDS = (
     *("plan", "bench_scan", "live", "analyze", "reidentify", "calibrate", "references"),
@@ -71,6 +71,7 @@ def command() -> NoReturn:
     was caught within an import makes it end by SIGINT.
     """
     status = 130
+    keep_memory()
     if isinstance(sys.stdout, io.TextIOWrapper):  # a letter of a name that the terminal does not have
         sys.stdout.reconfigure(errors="backslashreplace")
     with contextlib.suppress(KeyboardInterrupt):  # one that came as the command ended
