@@ -133,6 +133,25 @@ def test_goals_that_are_wrong_are_rejected_with_the_reason_and_nothing_is_left(s
 
 
 @pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_a_goal_that_takes_long_to_check_holds_up_nothing_else(stack, monkeypatch):
+    stack.activate()
+    begun, answered, waited = threading.Event(), threading.Event(), []
+
+    def check(*_, **__):
+        begun.set()
+        waited.append(answered.wait(5.0))
+        raise ValueError("checked")
+
+    monkeypatch.setattr(scan_node, "new_run", check)
+    scan = stack.client.scan(**GOAL)
+    stack.until(begun.is_set)
+    stack.until(stack.client.pause().done)
+    answered.set()
+    assert stack.ended(scan).message == "checked"
+    assert waited == [True]
+
+
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
 def test_a_node_is_not_cleaned_up_before_its_scan_has_ended(stack):
     stack.activate()
     scan = stack.begin([])
