@@ -249,8 +249,12 @@ def transient_free_spectra(
         columns = np.take(bins, group.bins, axis=-1).view(float)  # (..., 2, W, 2 L)
         projected = np.matmul(group.projector, columns).view(complex)  # (..., 2, 1 + dof, L)
         spectra[..., lines] = projected[..., 0, :]
-        residual = projected[..., 1:, :]
-        covariance[..., lines] = np.einsum("...ipf,...jpf->...ijf", residual, residual.conj())
+        y, u = projected[..., 0, 1:, :], projected[..., 1, 1:, :]  # residuals
+        covariance[..., 0, 0, lines] = _sum_of_squares(y)
+        covariance[..., 1, 1, lines] = _sum_of_squares(u)
+        cross = np.sum(y * u.conj(), axis=-2)  # (..., L)
+        covariance[..., 0, 1, lines] = cross
+        covariance[..., 1, 0, lines] = cross.conj()
     if not np.isfinite(spectra.sum()):  # the sum shows it, at half the cost of testing all
         raise ValueError(_NOT_FINITE)
     return PeriodicSpectra(
@@ -262,6 +266,13 @@ def transient_free_spectra(
         noise_dof=groups[0].projector.shape[0] - 1,
         method=f"fast local polynomial method, order {order}",
     )
+
+
+def _sum_of_squares(residual: ComplexArray) -> FloatArray:
+    """(..., L) sum of absolute squares of residuals (..., dof, L)."""
+    parts = residual.view(float)  # (..., dof, 2 L), real and imaginary alternate
+    squares = np.einsum("...ij,...ij->...j", parts, parts)  # no complex product, no root
+    return np.asarray(squares[..., 0::2] + squares[..., 1::2])
 
 
 @dataclass(frozen=True, eq=False)
