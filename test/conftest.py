@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures shared by all tests."""
 
+import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from tactile_resonance.processes import ENDING
 
 # The same examples in every run, as all random numbers here are seeded: a change is judged by what it changes.
 # ``--hypothesis-profile default`` looks for new ones.
@@ -19,3 +22,12 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("records with reference answers (../shared/data) are not here")
     return folder
+
+
+@pytest.fixture
+def handlers():
+    """Handlers of signals are as they were, afterwards."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)

@@ -51,7 +51,7 @@ def test_a_domain_that_is_given_is_taken():
 
 
 def told_of_ended(nodes, count):
-    """What is told of nodes once so many have ended."""
+    """What `check` reports once so many nodes have ended."""
     told = ""
     while told.count("ended with") < count:
         time.sleep(0.01)
@@ -72,7 +72,7 @@ def test_every_node_that_has_ended_is_named_with_its_last_line(tmp_path):
 
 
 def test_parameters_reach_a_node_as_they_are(tmp_path):
-    texts = ("", "a: b", "on", "null", "1e3", "[x]", "# no comment", "it's \"so\"", "ü", "/tmp/a b")
+    texts = ("", "a: b", "on", "null", "1e3", "[x]", "# no comment", "it's \"so\"", "ü", "a folder/b")
     given = {f"text{k}": text for k, text in enumerate(texts)}
     given |= {"flag": True, "rate_hz": 2.5, "count": 3, "names": ["1", "on"]}
     with NodeProcesses(tmp_path, ("printf", "%s\\n")) as nodes:

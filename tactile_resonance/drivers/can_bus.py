@@ -57,7 +57,7 @@ class Frame(NamedTuple):
 
 @lru_cache(maxsize=64)  # few on a bus, again and again
 def _can_id(kind: bytes, number: bytes) -> int:
-    """Return the identifier of a message, with its flags; ``ValueError`` where it is no number."""
+    """Return the identifier of a message, with its flags; ``ValueError`` where it is not hexadecimal."""
     flags = EXTENDED | ERROR if kind != b"frame" else EXTENDED if len(number) > 3 else 0
     return int(number, 16) | flags
 

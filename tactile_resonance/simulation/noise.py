@@ -81,15 +81,15 @@ class Jitter:
     def step(self) -> Vector:
         """Advance one period; return the displacement [m]."""
         if not self._left:
-            places = _tremble(self._state, self._by, self._random.standard_normal((ROWS, 6)))
+            places = np.empty((ROWS, 3))  # written there: a kernel that returns arrays cannot be interrupted
+            _tremble(self._state, self._by, self._random.standard_normal((ROWS, 6)), places)
             self._left = [*map(tuple, places[::-1].tolist())]
         return self._left.pop()
 
 
-@njit(float64[:, ::1](float64[:, ::1], float64[:, ::1], float64[:, ::1]), cache=True)
-def _tremble(state, by, noise):
-    """Advance place and speed of three axes, once for each row of noise; return the places (rows, 3)."""
-    places = np.empty((len(noise), 3))
+@njit((float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1]), cache=True)
+def _tremble(state, by, noise, places):
+    """Advance place and speed of three axes, once for each row of noise; write the places (rows, 3)."""
     for row in range(len(noise)):
         for k in range(3):
             place, speed, first, second = state[0, k], state[1, k], noise[row, k], noise[row, 3 + k]
@@ -97,4 +97,3 @@ def _tremble(state, by, noise):
                 a, b, c, d = by[n, 0], by[n, 1], by[n, 2], by[n, 3]
                 state[n, k] = a * place + b * speed + c * first + d * second
             places[row, k] = state[0, k]
-    return places

@@ -25,7 +25,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.running import STREAM
 from tactile_resonance.nodes.scan_node import RUNNING
-from tactile_resonance.processes import ENDING, NodeProcesses, noting_signals
+from tactile_resonance.processes import NodeProcesses, noting_signals
 from tactile_resonance.scan.table_calibration import read_table
 
 SCENE = share_path("config/scenes/inclusion_scan.yaml")
@@ -226,15 +226,6 @@ def test_the_command_prints_what_was_found_or_why_it_was_not(ideal, capsys):
     np.testing.assert_allclose(table, true_table(), atol=5e-5)
     assert main(["calibrate-table", "--points", "[[0, 0], [0.01, 0]]"]) == 1
     assert "points: got 2; accepted is three points or more" in capsys.readouterr().err
-
-
-@pytest.fixture
-def handlers():
-    """Of signals: as they were, afterwards."""
-    before = {number: signal.getsignal(number) for number in ENDING}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 def test_an_interrupt_has_the_tip_drawn_back_and_ends_the_goal(ideal, handlers):

@@ -20,7 +20,7 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes import client as client_module
 from tactile_resonance.nodes.client import ScanClient
 from tactile_resonance.nodes.running import initialised
-from tactile_resonance.processes import ENDING, domain_is_free, free_domain_id, noting_signals
+from tactile_resonance.processes import domain_is_free, free_domain_id, noting_signals
 
 
 @pytest.mark.parametrize(
@@ -121,15 +121,6 @@ def test_silence_counts_only_while_this_process_runs(monkeypatch):
     assert after(3600.0, 1) == 1.5  # stopped meanwhile, as by Ctrl-Z
     assert after(0.5, 2) == 0
     assert after(0.5, 2) == 0.5
-
-
-@pytest.fixture
-def handlers():
-    """Of signals: as they were, afterwards."""
-    before = {number: signal.getsignal(number) for number in ENDING}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 def test_an_interrupt_counts_also_where_an_error_ends_what_was_under_way(handlers):
