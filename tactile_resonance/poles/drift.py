@@ -106,6 +106,24 @@ class _Step:
 
 
 @dataclass(frozen=True, eq=False)
+class Drifted:
+    """Poles of a record that changes.
+
+    Attributes
+    ----------
+    poles : Poles
+    fit : PolesBatch
+        To what is left of the record without its drift, shape ().
+    rest : (K,) complex
+        Bins of Y without it.
+    """
+
+    poles: Poles
+    fit: PolesBatch
+    rest: ComplexArray
+
+
+@dataclass(frozen=True, eq=False)
 class DriftingModes:
     """What modes whose poles change add to Y on the bins of the band.
 
@@ -308,7 +326,7 @@ def _converged(
 
 def poles_with_drift(
     plan: JointPlan, u: ComplexArray, y: ComplexArray, fit: PolesBatch
-) -> tuple[Poles, float] | None:
+) -> Drifted | None:
     """Mean poles over a record and their drift, where it shows that they change.
 
     Parameters
@@ -322,10 +340,9 @@ def poles_with_drift(
 
     Returns
     -------
-    tuple of Poles and float, or None
-        With the variance of the noise that is left on a bin of Y. None where nothing changes beyond chance.
-        Status MODEL_ERROR where something changes that is no drift of the poles: the gain too, as where
-        contact is lost, or no fit with drift is found.
+    Drifted or None
+        None where nothing changes beyond chance. Status MODEL_ERROR where something changes that is no drift of
+        the poles: the gain too, as where contact is lost, or no fit with drift is found; then `rest` is y.
     """
     modes, found = DriftingModes(plan, fit, u), None
     with np.errstate(all="ignore"):
@@ -358,9 +375,9 @@ def poles_with_drift(
                 poles = _changed(poles, GAIN_TOO)
             elif modes.left_out(drift) > MOST_LEFT_OUT:
                 poles = _changed(poles, TOO_NARROW)
-            return poles, float(modes.fit.noise_variance[0])
+            return Drifted(poles, modes.fit, y - modes.added(drift))
     reason = "the mode changes over the record, or is disturbed in it, and no fit with a drift is found"
-    return _changed(single(fit), reason), float(fit.noise_variance[0])
+    return Drifted(_changed(single(fit), reason), fit, y)
 
 
 def _changed(poles: Poles, reason: str) -> Poles:

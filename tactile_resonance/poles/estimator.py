@@ -25,7 +25,7 @@ from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.noise_level import channels_of, two_channels
 from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
-from tactile_resonance.poles.tones import poles_without_tones
+from tactile_resonance.poles.tones import has_tones, poles_without_tones
 
 POLES_METHODS = ("auto", "joint", "frf")
 
@@ -223,12 +223,16 @@ def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
     poles = _poles_with_all_bins(plan, u, y, batch)
     if poles is not None:
         return poles
-    rest, tones = poles_without_tones(plan, u, y, batch)
+    drifted = None
     if y.ndim == 1 and plan.periods > 1 and plan.others_at.size:
-        found = poles_with_drift(plan, u, y, batch)
-        # a drift fills the bins beside a line as tones would: what leaves less noise is right
-        if found is not None and (not tones or found[1] < rest.noise_variance[0]):
-            return found[0]
+        drifted = poles_with_drift(plan, u, y, batch)
+        # a drift fills the bins beside a line as tones would, for which dozens of fits are made
+        if drifted is not None and not has_tones(plan, u, drifted.rest, drifted.fit):
+            return drifted.poles
+    rest, tones = poles_without_tones(plan, u, y, batch)
+    # what leaves less noise is right
+    if drifted is not None and not (tones and rest.noise_variance[0] <= drifted.fit.noise_variance[0]):
+        return drifted.poles
     return single(rest, notes=[tone.text("left out") for tone in tones])
 
 

@@ -149,6 +149,11 @@ class _Fitted:
         return np.asarray(falls_without_each(bases, self._output[0], u, scale, error).mean(axis=0))
 
 
+def has_tones(plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch) -> bool:
+    """Whether a bin of u, y (K,) or (M, K) stands out from their fit, shape (), as one with a tone does."""
+    return _most_striking(_Fitted(plan, batch, np.atleast_2d(u), np.atleast_2d(y))) is not None
+
+
 def poles_without_tones(
     plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch
 ) -> tuple[PolesBatch, tuple[Tone, ...]]:
