@@ -355,13 +355,22 @@ class LinesPlan(FitPlan):
         unit_s = self.delay_unit_s
         return replace(super().model_of(theta[:, :-1]), delay_s=theta[:, -1] * unit_s, delay_unit_s=unit_s)
 
+    @property
+    def _one_by_one(self) -> bool:
+        """Whether the model is none for the compiled fit."""
+        return self.structure.delay or self.structure.order > LARGEST_BATCHED_ORDER
+
+    def batched(self, data: BinData) -> tuple[LinesPlan, Solution]:
+        """As `FitPlan.batched`; models that are none for it at full precision."""
+        if not self._one_by_one:
+            return super().batched(data)
+        return (self if self.structure.delay else self.settled(data))._fit_dense(data)
+
     def fit(self, data: BinData) -> tuple[LinesPlan, Solution]:
-        """As `FitPlan.fit`; what that cannot do at full precision."""
-        if self.structure.order > LARGEST_BATCHED_ORDER:
-            return self.settled(data)._fit_dense(data)
-        if self.structure.delay:
-            return self._fit_dense(data)
-        _, solution = super().fit(data)
+        """As `batched`; at full precision what does not converge or is ill-conditioned, too."""
+        plan, solution = self.batched(data)
+        if self._one_by_one:
+            return plan, solution
         converged, condition = solution.converged, solution.condition
         doubtful = np.flatnonzero(~converged | ~(condition < NORMAL_EQUATIONS_LIMIT))
         if len(data.y) == 1 and doubtful.size:
@@ -374,9 +383,9 @@ class LinesPlan(FitPlan):
 
     def compared(self, data: BinData, start: FloatArray | None = None) -> ComplexArray:
         """As `FitPlan.compared`, from start values; of what the batched solver cannot do a whole fit."""
-        if self.structure.order <= LARGEST_BATCHED_ORDER and not self.structure.delay:
+        if not self._one_by_one:
             return super().compared(data)
-        plan, solution = self.fit(data)
+        plan, solution = self.batched(data)
         return plan.poles_in_band(solution.theta[:, 0])
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")

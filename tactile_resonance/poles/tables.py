@@ -347,8 +347,12 @@ class FitPlan(ABC):
         """Poles (points, places) of a fit of few iterations that others are compared with."""
         return self.poles_in_band(minimise(self.problem, data, start, COMPARISON).theta[:, 0])
 
-    def fit(self, data: BinData) -> tuple[Self, Solution]:
-        """Fit of all points of a batch, and the plan of its coefficients, which may have other bases."""
+    def batched(self, data: BinData) -> tuple[Self, Solution]:
+        """Compiled fit of all points, and the plan of its coefficients, which may have other bases.
+
+        What does not converge stays as it is: a mode that the data do not determine costs full precision
+        more than all else, and ends in one of many minima.
+        """
         solution = minimise(self.problem, data)
         if self.structure.order >= SEVERAL_MODES:
             solution = best_of_split(self, data, solution)
@@ -359,7 +363,7 @@ class FitPlan(ABC):
 
         That is (points, places, 2, 2) of (f0_hz, damping_ratio); NaN where the data do not determine the mode.
         """
-        plan, solution = self.fit(data)
+        plan, solution = self.batched(data)
         own, n = plan.problem.sizes[2], solution.theta.shape[-1]
         free = data.records * own + n - own
         dof = max(data.records * data.order.size - free / 2, 1)
