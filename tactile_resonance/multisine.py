@@ -80,22 +80,20 @@ class Excitation:
     bands: tuple[PoleBand, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, kind in (("harmonics", "i"), ("amplitude_v", "f"), ("phase_rad", "f")):
-            given = getattr(self, name).dtype
-            if given.kind != kind:
-                accepted = {"i": "signed integers", "f": "real numbers"}[kind]
-                raise ValueError(f"{name}: values of type {given}, expected {accepted}")
-        _check_period(self.sample_rate_hz, self.samples_per_period)
+        rate_hz = self.sample_rate_hz
+        require(0 < rate_hz < np.inf, "sample_rate_hz", rate_hz, "a number above 0")
+        for name, least in (("samples_per_period", 4), ("periods", 1), ("realisations", 1)):
+            value = getattr(self, name)
+            require(value >= least, name, value, f"{least} or above")
+        given = self.harmonics.dtype
+        require(given.kind == "i", "harmonics", f"values of type {given}", "signed integers")
         checked_harmonics(self.harmonics, self.samples_per_period)
+        accepted = f"finite real numbers of shape {self.harmonics.shape}"
         for name in ("amplitude_v", "phase_rad"):
             array = getattr(self, name)
-            if array.shape != self.harmonics.shape or not np.all(np.isfinite(array)):
-                raise ValueError(
-                    f"{name}: shape {array.shape}, expected {self.harmonics.shape} finite values"
-                )
-        for name in ("periods", "realisations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: {getattr(self, name)}, expected at least 1")
+            good = array.dtype.kind == "f" and array.shape == self.harmonics.shape
+            good = good and bool(np.all(np.isfinite(array)))
+            require(good, name, f"{array.dtype} of shape {array.shape}", accepted)
 
     @property
     def frequency_hz(self) -> FloatArray:
@@ -133,16 +131,13 @@ class Excitation:
 def checked_harmonics(harmonics: npt.ArrayLike, samples_per_period: int) -> IntArray:
     """(F,) int harmonics, read-only; ValueError unless ascending within 1..(N - 1) // 2."""
     array = np.array(harmonics)
-    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "iu":
-        raise ValueError(
-            f"harmonics: {array.dtype} of shape {array.shape}, expected (F,) integers, F >= 1"
-        )
+    good = array.ndim == 1 and array.size > 0 and array.dtype.kind in "iu"
+    given = f"{array.dtype} of shape {array.shape}"
+    require(good, "harmonics", given, "(F,) integers, F >= 1")
     array = array.astype(np.int64)
     last = (samples_per_period - 1) // 2
-    if array[0] < 1 or array[-1] > last or np.any(np.diff(array) < 1):
-        raise ValueError(
-            f"harmonics: {array[0]}..{array[-1]}, expected ascending, within 1..{last}"
-        )
+    good = array[0] >= 1 and array[-1] <= last and bool(np.all(np.diff(array) >= 1))
+    require(good, "harmonics", f"{array[0]}..{array[-1]}", f"ascending, within 1..{last}")
     array.flags.writeable = False
     return array
 
@@ -173,10 +168,8 @@ def harmonics_on_grid(
     ValueError
         If the band is empty on this grid, or the grid has no rule.
     """
-    if grid is Grid.CUSTOM:
-        raise ValueError("grid: custom has no rule; accepted are full, odd, odd_random")
-    if block_lines < 2:
-        raise ValueError(f"block_lines: {block_lines}, expected at least 2")
+    require(grid is not Grid.CUSTOM, "grid", grid.value, "full, odd or odd_random, which have a rule")
+    block_lines = whole(block_lines, "block_lines", 2)
     lines = np.arange(low, high + 1, dtype=np.int64)
     if grid is not Grid.FULL:
         lines = lines[lines % 2 == 1]
@@ -184,8 +177,8 @@ def harmonics_on_grid(
         blocks = lines.size // block_lines
         left_out = np.random.default_rng([seed, 0]).integers(block_lines, size=blocks)
         lines = np.delete(lines, np.arange(blocks) * block_lines + left_out)
-    if lines.size == 0:
-        raise ValueError(f"band: harmonics {low}..{high} hold no line of the {grid.value} grid")
+    accepted = f"one that holds a line of the {grid.value} grid"
+    require(lines.size > 0, "band", f"harmonics {low}..{high}", accepted)
     return lines
 
 
@@ -212,11 +205,8 @@ def mains_lines(
     width_hz = (2 * lines_beside + 1) * spacing_hz
     found = np.zeros(np.shape(frequency_hz), bool)
     for mains in mains_hz:
-        if not width_hz < mains < np.inf:
-            raise ValueError(
-                f"mains_hz: {mains:g}, expected above {width_hz:g} Hz, what {2 * lines_beside + 1} "
-                f"lines of {spacing_hz:g} Hz take up"
-            )
+        taken = f"above {width_hz:g} Hz, what {2 * lines_beside + 1} lines of {spacing_hz:g} Hz take up"
+        require(width_hz < mains < np.inf, "mains_hz", mains, taken)
         harmonic = np.maximum(np.round(frequency_hz / mains), 1)
         found |= np.abs(frequency_hz - harmonic * mains) < width_hz / 2
     return found
@@ -297,17 +287,15 @@ def design_multisine(
     """
     rate_hz = number(sample_rate_hz, "sample_rate_hz")
     samples = whole(samples_per_period, "samples_per_period", 4)
-    _check_period(rate_hz, samples)
+    require(rate_hz > 0, "sample_rate_hz", rate_hz, "a number above 0")
     resolution_hz = rate_hz / samples
     stretches_hz = _stretches(band_hz, rate_hz / 2)
     require(number(level_v, "level_v") > 0, "level_v", level_v, "a voltage above 0")
-    block_lines = whole(block_lines, "block_lines", 2)
     seed, realisation = whole(seed, "seed"), whole(realisation, "realisation")
     choices = ", ".join(f"{kind.name} ({kind.value!r})" for kind in Grid if kind is not Grid.CUSTOM)
     require(grid in [*Grid, *(kind.value for kind in Grid)], "grid", grid, f"Grid of {choices}")
     grid = Grid(grid)
-    if scale_by not in ("rms", "peak"):
-        raise ValueError(f"scale_by: {scale_by!r}, accepted are 'rms' and 'peak'")
+    require(scale_by in ("rms", "peak"), "scale_by", scale_by, "'rms' or 'peak'")
     # 1e-9: a band edge that is a line stays in the band whatever the rounding of the division
     ends = np.array(stretches_hz) / resolution_hz + [-1e-9, 1e-9]
     harmonics = np.concatenate(
@@ -322,10 +310,8 @@ def design_multisine(
     require(apart, "band_hz", band_hz, "bands that are ascending and share no line")
     frequency_hz = np.asarray(harmonics * resolution_hz, float)
     hum = mains_lines(frequency_hz, resolution_hz, numbers(mains_hz, "mains_hz"), lines_beside)
-    if hum.all():
-        raise ValueError(
-            f"mains_hz: {list(mains_hz)} leave no line of {frequency_hz[0]:g}..{frequency_hz[-1]:g} Hz"
-        )
+    accepted = f"what leaves a line of {frequency_hz[0]:g}..{frequency_hz[-1]:g} Hz"
+    require(not hum.all(), "mains_hz", list(mains_hz), accepted)
     harmonics = harmonics[~hum]
     shape = np.ones(harmonics.size)
     if relative_amplitude is not None:
@@ -333,10 +319,9 @@ def design_multisine(
             shape = np.asarray(relative_amplitude, float)
         except (TypeError, ValueError):
             shape = np.empty(0)
-        if shape.shape != harmonics.shape or not np.all(shape > 0) or np.any(np.isinf(shape)):
-            raise ValueError(
-                f"relative_amplitude: shape {shape.shape}, expected {harmonics.shape} positive values"
-            )
+        good = shape.shape == harmonics.shape and bool(np.all((shape > 0) & (shape < np.inf)))
+        accepted = f"numbers above 0 of shape {harmonics.shape}"
+        require(good, "relative_amplitude", f"values of shape {shape.shape}", accepted)
         shape = shape / shape.max()  # squares of what is very large or small would not be finite, or 0
     require_kind(sweep, "sweep", bool)
     require_kind(label, "label", str)
@@ -412,13 +397,10 @@ def compress_crest_factor(excitation: Excitation, *, passes: int = 300) -> Excit
     and takes back the amplitudes wanted (Van der Ouderaa, Schoukens, Renneboog, IEEE Trans. Instrum.
     Meas. 37 (1988) 145-147).
     """
-    if excitation.realisations > 1:
-        raise ValueError(
-            f"realisations: {excitation.realisations}, compressed phases are not random, so several "
-            "realisations would not show nonlinear distortion; accepted is 1"
-        )
-    if passes < 1:
-        raise ValueError(f"passes: {passes}, expected at least 1")
+    several = excitation.realisations
+    accepted = "1: compressed phases are not random, so several would not show nonlinear distortion"
+    require(several == 1, "realisations", several, accepted)
+    passes = whole(passes, "passes", 1)
     n = excitation.samples_per_period
     lines, amplitude = excitation.harmonics, excitation.amplitude_v
     spectrum = np.zeros(n // 2 + 1, complex)
@@ -449,10 +431,3 @@ def _stretches(band_hz: Any, most_hz: float) -> list[tuple[float, float]]:
     accepted = f"(low, high) in Hz with 0 < low <= high < {most_hz:g}, or several of them"
     require(good, "band_hz", band_hz, accepted)
     return ends
-
-
-def _check_period(sample_rate_hz: float, samples_per_period: int) -> None:
-    if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):
-        raise ValueError(f"sample_rate_hz: {sample_rate_hz}, expected a positive frequency")
-    if samples_per_period < 4:
-        raise ValueError(f"samples_per_period: {samples_per_period}, expected at least 4")

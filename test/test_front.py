@@ -235,7 +235,7 @@ def test_a_band_without_lines_is_refused_for_recording_and_response_alike(record
         (lambda r: tr.design_multisine(seed="a"), "seed: got 'a'; accepted is a whole number"),
         (lambda r: tr.design_multisine(realisation=-1), "realisation: got -1; accepted is a whole"),
         (lambda r: tr.design_multisine(mains_hz=50.0), "mains_hz: got 50.0; accepted is a list"),
-        (lambda r: tr.design_multisine(relative_amplitude="x"), "relative_amplitude: .*positive"),
+        (lambda r: tr.design_multisine(relative_amplitude="x"), "relative_amplitude: .*above 0"),
     ],
 )
 def test_wrong_arguments_are_named_with_what_is_accepted(recording, call, message):

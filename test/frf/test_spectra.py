@@ -268,10 +268,10 @@ def test_a_single_period_has_no_covariance(multisine):
         ({"order": -1}, "order: -1"),
         ({"dof": 0}, "dof: 0"),
         ({"dof": 90}, "dof: 2, 90 need 94 bins between harmonics, .* has 50; lower either"),
-        ({"harmonics": np.array([0, 1])}, r"harmonics: 0\.\.1, .* within 1\.\.24"),
-        ({"harmonics": np.array([3, 25])}, r"harmonics: 3\.\.25, .* within 1\.\.24"),
+        ({"harmonics": np.array([0, 1])}, r"harmonics: got '0\.\.1'; .* within 1\.\.24"),
+        ({"harmonics": np.array([3, 25])}, r"harmonics: got '3\.\.25'; .* within 1\.\.24"),
         ({"harmonics": np.array([3, 3])}, "harmonics: .* ascending"),
-        ({"harmonics": np.array([1.5])}, "harmonics: float64 of shape"),
+        ({"harmonics": np.array([1.5])}, "harmonics: got 'float64 of shape"),
         ({"harmonics": np.array([], int)}, "harmonics: .* F >= 1"),
     ],
 )

@@ -186,7 +186,7 @@ def test_lines_of_the_mains_are_left_out_where_the_laboratory_says_so(ros):
         ]
         assert left.level_v == pytest.approx(whole.level_v)
         node.set_parameters([RosParameter("mains_hz", value=5.0)])
-        with pytest.raises(ValueError, match="mains_hz: 5, expected above 7.5 Hz"):
+        with pytest.raises(ValueError, match="mains_hz: got 5.0; accepted is above 7.5 Hz"):
             excitation_node.design(node, goal, 0)
     finally:
         node.destroy_node()
