@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy import special
+from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
@@ -302,7 +303,7 @@ def find_normals(
 
 def places_around(point: ScanPoint, request: NormalRequest) -> list[ScanPoint]:
     """Where the touches about a point come down, on the plane that is expected there."""
-    turn = _frame(point.normal)
+    turn = Rotation.from_quat(point.orientation_xyzw).as_matrix()
     angles = 2 * math.pi * np.arange(request.touches) / request.touches
     circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(request.touches)])
     places = np.array(point.position_m) + request.radius_m * circle @ turn.T
@@ -339,7 +340,7 @@ def normal_of_touches(
     ValueError
         If the touches do not determine a plane.
     """
-    turn, place = _frame(point.normal), np.array(point.position_m)
+    turn, place = Rotation.from_quat(point.orientation_xyzw).as_matrix(), np.array(point.position_m)
     local = (np.array([touch.ball_m for touch in touches]) - place) @ turn  # (n, 3)
     plane = fit_surface(local, [touch.std_m for touch in touches], "plane")
     across = plane.normal([0.0, 0.0])
@@ -375,11 +376,3 @@ def _require_good(facts: Mapping[str, Any], request: NormalRequest) -> None:
     ):
         most = getattr(request, name)
         require(value <= most, what, value, f"{name} = {most:g} or less{otherwise}")
-
-
-def _frame(normal: tuple[float, float, float]) -> FloatArray:
-    """(3, 3) axes in columns, the third along a normal."""
-    z = np.asarray(normal, float)
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
