@@ -16,8 +16,8 @@ from typing import NoReturn
 from tactile_resonance.processes import ENDING, keep_memory
 
 COMMANDS = (
-    *("plan", "bench_scan", "live", "analyze", "reidentify", "calibrate", "references"),
-    *("mechanics", "report", "benchmark", "calibrate_table", "simulate", "first_use"),
+    *("plan", "bench_scan", "report", "analyze", "reidentify", "calibrate", "references"),
+    *("mechanics", "benchmark", "calibrate_table", "simulate", "first_use"),
 )
 """Modules of `commands`, in the order in which help lists them."""
 

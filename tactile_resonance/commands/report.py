@@ -1,21 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`tactile_resonance report`: page and picture of a run, and of several runs beside each other."""
+"""`tactile_resonance report` of runs, and `live` of a scan under way: their pages."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from tactile_resonance.commands.options import add_option, add_output
+from tactile_resonance.commands.options import add_option, add_output, require_packages
+from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
 from tactile_resonance.front import read_run
+from tactile_resonance.processes import noting_signals
 
 COMPARISON = Path("comparison.html")
+PORT = 8765
+EACH_S = 0.2
+"""Between two events of the page of a scan under way [s]."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Options of the command."""
+    """Options of both commands."""
     parser = commands.add_parser(
         "report",
         help="page and picture of a scan's run; comparison of several",
@@ -29,16 +36,23 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     text = f"of a comparison (default: {COMPARISON}); the files of one run are in its folder"
     add_output(parser, "--output FILE", text, ".html")
     parser.set_defaults(run=run)
+    parser = commands.add_parser(
+        "live",
+        help="page of a scan while it goes on: map, force, poles, state",
+        description="Listen to the nodes of this ROS_DOMAIN_ID and serve a page that shows what they publish: "
+        "the map as it grows, force, poles and state; on 127.0.0.1 only, and to be read only. Ctrl-C ends it.",
+    )
+    add_option(parser, "--port", int, f"default: {PORT}; 0: any that is free", default=PORT)
+    add_option(parser, "--namespace", "", "of the nodes (default: none)")
+    parser.set_defaults(run=listen)
 
 
 def run(options: argparse.Namespace) -> int:
     """Read, draw, write each file whole."""
     if len(options.run_folders) > 1:
         return _compare(options.run_folders, options.output or COMPARISON)
-    if options.output is not None:
-        raise ValueError(
-            f"--output: {options.output}, accepted with several runs only: files of one run are in its folder"
-        )
+    output = options.output and str(options.output)
+    require(output is None, "--output", output, "none with one run, whose files are in its folder")
     return report_run(options.run_folders[0])
 
 
@@ -111,3 +125,45 @@ def report_run(folder: Path) -> int:
         drawn.append(RECORDING)
     print(f"{', '.join(drawn)} in {folder}")
     return 0
+
+
+def listen(options: argparse.Namespace) -> int:
+    """Serve the page of what the nodes publish until interrupted."""
+    from tactile_resonance.report.live import LiveRun, LiveServer
+
+    require_packages("rclpy", "tactile_resonance.msg")
+    from rclpy.exceptions import InvalidNamespaceException
+    from rclpy.validate_namespace import validate_namespace
+
+    try:
+        validate_namespace(f"/{options.namespace.strip('/')}")
+    except InvalidNamespaceException as error:
+        accepted = "a ROS namespace: letters, digits, _ and /, no digit at the beginning of a part"
+        require(not error, "--namespace", options.namespace, accepted)
+    from tactile_resonance.nodes.client import LiveListener
+
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    live = LiveRun(lambda name, data: server.publish(name, data))
+    server = LiveServer(options.port, live.snapshot)
+    ended, failed = threading.Event(), list[Exception]()
+
+    def tick() -> None:
+        try:
+            while not ended.wait(EACH_S):
+                if server.readers:
+                    live.tick()
+        except Exception as error:
+            # raised again below: a page that stands still would seem to be live
+            failed.append(error)
+
+    with noting_signals() as check, server, LiveListener(live, options.namespace) as listener:
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        print(f"{server.url} shows the nodes of ROS_DOMAIN_ID={domain}; Ctrl-C ends it", flush=True)
+        threading.Thread(target=tick, daemon=True).start()
+        try:
+            while not failed:
+                check()
+                listener.spin(EACH_S)
+            raise failed[0]
+        finally:
+            ended.set()

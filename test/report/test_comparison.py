@@ -220,7 +220,7 @@ def test_a_click_shows_no_point_of_another_frame_or_height_as_one_of_its_place(p
 
 def test_output_is_for_comparisons(page, tmp_path, capsys):
     assert main(["report", str(page[1][0]), "--output", str(tmp_path / "x.html")]) == 1
-    assert "accepted with several runs only" in capsys.readouterr().err
+    assert "accepted is none with one run" in capsys.readouterr().err
 
 
 def test_a_comparison_never_replaces_a_file_of_another_kind(page, tmp_path, capsys):

@@ -165,7 +165,7 @@ def test_the_map_between_points_costs_a_bounded_share_of_the_time():
 
 def test_a_page_that_cannot_go_on_ends_its_command(monkeypatch):
     pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
-    from tactile_resonance.commands import live as command
+    from tactile_resonance.commands import report as command
     from tactile_resonance.nodes import client
 
     until_s = time.monotonic() + 20.0
@@ -186,7 +186,7 @@ def test_a_page_that_cannot_go_on_ends_its_command(monkeypatch):
     monkeypatch.setattr(LiveRun, "tick", broken)
     monkeypatch.setattr(command, "noting_signals", lambda: contextlib.nullcontext(lambda: None))
     with pytest.raises(ZeroDivisionError, match="of a map"):
-        command.run(argparse.Namespace(port=0, namespace=""))
+        command.listen(argparse.Namespace(port=0, namespace=""))
 
 
 def test_details_of_a_long_scan_are_bounded():
