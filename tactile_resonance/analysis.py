@@ -121,8 +121,8 @@ def analyse(
     require(abs(channel_delay_s) <= most_s, "channel_delay_s", channel_delay_s, accepted)
     if band_hz is not None:
         band_hz = band(band_hz, most_hz=recording.sample_rate_hz / 2)
-    if poles_method not in POLES_METHODS:
-        raise ValueError(f"poles_method: {poles_method!r}, accepted are {', '.join(POLES_METHODS)}")
+    accepted = f"one of {', '.join(POLES_METHODS)}"
+    require(poles_method in POLES_METHODS, "poles_method", poles_method, accepted)
     recording.require_driven()
     if poles_method == "joint" and channel_delay_s:
         raise ValueError("poles_method: joint takes no channel delay, use frf")
@@ -271,10 +271,7 @@ def _strongest_resonance_band(frf: FRF) -> tuple[float, float]:
     resonance whatever the other modes add. It is averaged over five lines against noise.
     """
     f = frf.frequency_hz
-    if f.size < 10:
-        raise ValueError(
-            f"band: {f.size} excited lines, at least 10 are needed to find a resonance"
-        )
+    require(f.size >= 10, "band", f"{f.size} excited lines", "10 or more, to find a resonance")
     speed = np.abs(np.diff(frf.g) / np.diff(f))
     speed = np.convolve(speed, np.ones(5) / 5, mode="same")
     speed[:2] = speed[-2:] = 0.0  # fewer than five lines were averaged there

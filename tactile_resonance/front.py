@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_resonance.analysis import analyse
-from tactile_resonance.fields import require_kind, whole
+from tactile_resonance.fields import require, require_kind, whole
 from tactile_resonance.frf.estimate import frf_of_record, with_narrow_modes_judged
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import FRF, FrfStatus
@@ -80,10 +80,8 @@ def read_record(
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such file or folder", str(path))
     if not path.is_dir():
-        if measurement_id is not None:
-            raise ValueError(
-                f"measurement_id: {measurement_id}, only for a folder of records; {path} is a file"
-            )
+        accepted = "none with a file, only with a folder of records"
+        require(measurement_id is None, "measurement_id", measurement_id, accepted)
         return read_recording(path, periods=periods, **fields)
     for name in fields:
         raise ValueError(f"{name}: only for a file; {path} is a folder, whose records say it")

@@ -67,7 +67,7 @@ sys.exit(main(sys.argv[1:]))
 
 def test_a_larger_grid_is_refused_where_there_is_none(tmp_path, capsys):
     assert cli.main(["benchmark", "frf", "--full", "--output", str(tmp_path / "out")]) == 1
-    assert "--full: accepted of contact, hostile" in capsys.readouterr().err
+    assert "--full: got True; accepted is with contact, hostile only" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

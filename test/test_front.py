@@ -132,7 +132,7 @@ def test_fields_of_a_file_are_refused_for_a_folder(tmp_path):
         tr.read_record(tmp_path, sample_rate_hz=1e3)
     (tmp_path / "x.npz").touch()
     with pytest.raises(
-        ValueError, match="measurement_id: 3, only for a folder of records; .* is a file"
+        ValueError, match="measurement_id: got 3; accepted is none with a file"
     ):
         tr.read_record(tmp_path / "x.npz", 3)
     with pytest.raises(FileNotFoundError, match="nothing_here"):
@@ -217,7 +217,7 @@ def test_a_band_without_lines_is_refused_for_recording_and_response_alike(record
         (lambda r: tr.analyse(r, candidates=2), "candidates: got a int; accepted is a Sequence"),
         (lambda r: tr.analyse(r, candidates=[2]), "candidates: got a int; accepted is a Model"),
         (lambda r: tr.analyse(r, channel_delay_s="1"), "channel_delay_s: got '1'; accepted is"),
-        (lambda r: tr.analyse(r, poles_method=[]), "poles_method: .*, accepted are auto"),
+        (lambda r: tr.analyse(r, poles_method=[]), "poles_method: .*; accepted is one of auto"),
         (lambda r: tr.identify_batch("x"), "frf: got a str; accepted is a FRF"),
         (lambda r: tr.identify_poles(tr.FRF("f", "g")), "frf.g: .*expected|accepted"),
         (lambda r: tr.identify_poles(tr.FRF([1.0], [1.0]), structure="2"), "structure: got a str"),

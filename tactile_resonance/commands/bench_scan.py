@@ -205,10 +205,8 @@ def run_job(job: Job) -> int:
     # what cannot be scanned is reported before anything is started
     content = read_scan_scene(job.scene)
     make_plan(content)
-    if read_phantoms(job.scene) is None:
-        raise ValueError(
-            f"{job.scene.name}: no regions; accepted is a scene with what the simulated bench touches"
-        )
+    touched = read_phantoms(job.scene) is not None
+    require(touched, f"{job.scene.name}: regions", None, "what the simulated bench touches")
     if not job.resume:
         RunDirectory.check_new(job.output, 0)
     else:

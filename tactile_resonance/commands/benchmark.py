@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_resonance.commands.options import add_option
+from tactile_resonance.fields import require
 from tactile_resonance.files import write_whole
 
 BAND_HZ = (200.0, 300.0)  # around the mode that is fitted
@@ -26,8 +27,8 @@ NAMES = (
     *("truth", "skip", "references", "report", "mechanics", "calibrate"),
     *("stability", "hostile", "faults", "endurance", "overview"),
 )
-WITH_FULL = ("contact", "hostile")
-"""Those with a larger grid than they run by default."""
+OF_SOME = {"full": ("contact", "hostile"), "part": ("poles",), "row": ("faults",), "guard": ("overview",)}
+"""Options, by the benchmarks that know them."""
 PARTS = ("methods", "bias", "grid", "realisations", "reidentify")
 """Tables of `poles`, each of which can be renewed alone."""
 PAGES = {"overview": "README.md", "faults": "../reliability.md"}
@@ -55,7 +56,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     add_option(parser, "name", str, "default: all", nargs="?", choices=NAMES)
     add_option(parser, "--quick", False, "fewer repetitions")
-    add_option(parser, "--full", False, f"the whole grid ({', '.join(WITH_FULL)})")
+    add_option(parser, "--full", False, f"the whole grid ({', '.join(OF_SOME['full'])})")
     add_option(parser, "--part", str, "renew this table of poles alone; default: all", choices=PARTS)
     text = "renew the rows of faults whose names hold this; default: all"
     add_option(parser, "--row TEXT", str, text)
@@ -202,25 +203,17 @@ def _benchmark(options: argparse.Namespace) -> int:
         raise ValueError(
             "benchmark: no benchmarks found, run it from the source tree: tools/run.sh"
         )
-    if options.part is not None and options.name != "poles":
-        raise ValueError(f"--part: {options.part} is a table of `benchmark poles`")
-    if options.row is not None and options.name != "faults":
-        raise ValueError(f"--row: {options.row} is a row of `benchmark faults`")
-    if options.full and options.name not in (None, *WITH_FULL):
-        raise ValueError(f"--full: accepted of {', '.join(WITH_FULL)}")
+    given = {name: value for name in OF_SOME if (value := getattr(options, name))}
+    for name, value in given.items():
+        known = (*OF_SOME[name], *([None] if name == "full" else []))
+        require(options.name in known, f"--{name}", value, f"with {', '.join(OF_SOME[name])} only")
     if options.guard:
-        if options.name != "overview":
-            raise ValueError("--guard: accepted is `benchmark overview --guard`")
         text, good = import_module("benchmarks.overview").guard()
         print(text)
         return 0 if good else 1
     options.output.mkdir(parents=True, exist_ok=True)
     for name in NAMES if options.name is None else (options.name,):
-        extra = {"full": True} if options.full and name in WITH_FULL else {}
-        if options.part is not None:
-            extra["part"] = options.part
-        if options.row is not None:
-            extra["row"] = options.row
+        extra = {option: value for option, value in given.items() if name in OF_SOME[option]}
         page = import_module(f"benchmarks.{name}").run(options.output, options.quick, **extra)
         write_page(options.output, name, page)
         print(page)

@@ -62,10 +62,7 @@ def run(options: argparse.Namespace) -> int:
             require(value == option.default, name, value, "none beside a run, which knows it")
     found = {path: list(_tests(path, options)) for path in options.paths}
     tests = [one for of_path in found.values() for one in of_path]
-    if not tests:
-        raise ValueError(
-            f"{options.paths[0]}: no mechanical test; a scene asks for them by protocols"
-        )
+    require(bool(tests), str(options.paths[0]), None, "a mechanical test; scenes ask by protocols")
     for path, of_path in found.items():
         for one in of_path:
             print("\n".join(_lines(one)))
@@ -101,14 +98,10 @@ def _read(path: Path, options: argparse.Namespace) -> IndentationRecord:
     from tactile_resonance.array_files import read_arrays
     from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 
-    if options.radius_m is None:
-        raise ValueError("--radius-m: not given; accepted is the radius of the ball [m]")
-    if options.rigid == (options.stiffness_n_per_m is not None):
-        raise ValueError(
-            "--stiffness-n-per-m: got "
-            f"{options.stiffness_n_per_m} with --rigid {options.rigid}; accepted is one of both: behind a "
-            "spring the indentation is not fixed while the stage is held"
-        )
+    require(options.radius_m is not None, "--radius-m", None, "the radius of the ball [m]")
+    spring = options.stiffness_n_per_m
+    accepted = "one of it and --rigid: behind a spring the indentation is not fixed while the stage is held"
+    require(options.rigid == (spring is None), "--stiffness-n-per-m", spring, accepted)
     arrays, names = read_arrays(path, COLUMNS)
     missing = [name for name in COLUMNS if name not in arrays]
     if missing:
@@ -117,7 +110,7 @@ def _read(path: Path, options: argparse.Namespace) -> IndentationRecord:
         require(
             arrays[name].dtype.kind != "c", f"{path.name}: {name}", "complex numbers", "real ones"
         )
-    stiffness = math.inf if options.rigid else options.stiffness_n_per_m
+    stiffness = math.inf if options.rigid else spring
     time_s, force_n, indentation_m = (arrays[name].ravel().astype(float) for name in COLUMNS)
     ball = BallTip(options.radius_m, options.poisson_ratio, stiffness)
     try:

@@ -271,8 +271,7 @@ def _compare(options: argparse.Namespace) -> int:
                 else:
                     kept.append((name, result))
                     rows.append(at)
-    if not rows:
-        raise ValueError(f"points: {dict(left_out)}, expected one with poles or more")
+    require(bool(rows), "points", dict(left_out), "one with poles or more")
     x, noise = (np.array(column) for column in list(zip(*rows, strict=True))[:2])
     spread, degrees = np.zeros((2, 2)), np.inf
     if options.library:

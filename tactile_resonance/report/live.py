@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_resonance.fields import known
+from tactile_resonance.fields import known, require
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.report.page import (
     MN,
@@ -249,8 +249,7 @@ class LiveServer(ThreadingHTTPServer):
     block_on_close = False
 
     def __init__(self, port: int, snapshot: Callable[[], dict[str, Any]]) -> None:
-        if not 0 <= port <= 65535:
-            raise ValueError(f"--port: {port}, expected 0 to 65535")
+        require(0 <= port <= 65535, "--port", port, "0 to 65535")
         self.snapshot = snapshot
         self._readers: set[queue.Queue[bytes | None]] = set()
         self._lock = threading.Lock()

@@ -148,11 +148,8 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     use, outputs = scene.sensor, set(scene.outputs)
     top_hz = min(F_MAX_HZ, MOST_OF_RATE * use.sample_rate_hz)
     for band in use.bands:
-        if band.low_hz < F_MIN_HZ or band.high_hz > top_hz:
-            raise ValueError(
-                f"sensor: got the band {band.low_hz:g} to {band.high_hz:g} Hz; accepted is within "
-                f"{F_MIN_HZ:g} to {top_hz:g} Hz"
-            )
+        within = band.low_hz >= F_MIN_HZ and band.high_hz <= top_hz
+        require(within, "sensor: band [Hz]", band.ends_hz, f"within {F_MIN_HZ:g} to {top_hz:g}")
     air = _design_in_air(scene) if use.calibrated else None
     whole_hz = ((F_MIN_HZ, top_hz),)
     # even distortion of a band falls outside of it: what is to show there must be excited there
@@ -166,11 +163,8 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     elif samples is None:
         samples, margin = shortest_samples(use.bands, use.sample_rate_hz, share, least_s), 0
     spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
-    if block_s < least_s:
-        raise ValueError(
-            f"sensor.samples_per_period: got {samples}, {block_s:.3g} s; accepted with a gate is {least_s:g} s "
-            "or more: of less it is not known how the force moved"
-        )
+    accepted = f"{least_s * use.sample_rate_hz:g} or more with a gate, which cannot judge a force of less time"
+    require(block_s >= least_s, "sensor.samples_per_period", samples, accepted)
     blocks = scene.blocks or _default_blocks(scene, block_s)
     narrow = not distortion and Output.FRF not in outputs
     stretches_hz = _stretches(use.bands, margin * spacing_hz, top_hz) if narrow else whole_hz
@@ -180,11 +174,9 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
         if use.calibrated:
             fewest = FEWEST_CALIBRATED - 1
         found = lines_of(band.ends_hz, spacing_hz, share)
-        if found <= fewest:
-            raise ValueError(
-                f"sensor: got {found} excited lines in the band {band.low_hz:g} to {band.high_hz:g} Hz, "
-                f"{spacing_hz:g} Hz apart; accepted is more than {fewest}"
-            )
+        where = f"sensor: excited lines from {band.low_hz:g} to {band.high_hz:g} Hz"
+        accepted = f"more than {fewest} (they are {spacing_hz:g} Hz apart)"
+        require(found > fewest, where, found, accepted)
     design = MeasurementDesign(
         bands=use.bands if air is None else air.bands,
         stretches_hz=stretches_hz,
@@ -310,11 +302,8 @@ def shortest_samples(
     for band in bands:
         width_hz = band.high_hz - band.low_hz
         least_hz = lines_wanted(band) / share / LONGEST_S
-        if width_hz < least_hz:
-            raise ValueError(
-                f"sensor: got the band {band.low_hz:g} to {band.high_hz:g} Hz with samples_per_period auto; "
-                f"accepted is {least_hz:.2g} Hz wide or more, for a period of {LONGEST_S:g} s at most"
-            )
+        accepted = f"{least_hz:.2g} Hz wide or more with samples_per_period auto: of {LONGEST_S:g} s at most"
+        require(width_hz >= least_hz, "sensor: band [Hz]", band.ends_hz, accepted)
     fewest = max(
         int((lines_wanted(band) / share - 1) * sample_rate_hz / (band.high_hz - band.low_hz))
         for band in bands

@@ -14,7 +14,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.force_spread import SHORTEST_S
 from tactile_resonance.contact.goal import LEAST_FORCE_N
 from tactile_resonance.contact.parameters import FORCE_SHARE, read_contact
-from tactile_resonance.fields import counted
+from tactile_resonance.fields import counted, require
 from tactile_resonance.scan.adaptive import Adaptive, WantedMap, known_points
 from tactile_resonance.scan.clearance import is_along, is_plane
 from tactile_resonance.scan.decision import Precise, Separate
@@ -224,11 +224,8 @@ def make_plan(scene: ScanScene, surface: Surface | None = None) -> Plan:
     with np.errstate(invalid="ignore"):
         steep = ~off & (normals[:, 2] < np.cos(STEEPEST_RAD))
     kept = ~off & ~steep
-    if not kept.any():
-        raise ValueError(
-            f"positions: got {len(xy)}, of which {int(off.sum())} beside the surface and {int(steep.sum())} "
-            "too steep; accepted is one usable position or more"
-        )
+    found = f"{len(xy)}, {int(off.sum())} beside the surface and {int(steep.sum())} too steep"
+    require(bool(kept.any()), "positions", found, "one usable position or more")
     turns = tip_orientation(normals[kept], scene.sensor.heading_rad)
     std = under.height_std_m(xy[kept])
     where = np.column_stack([xy[kept], z[kept]])

@@ -106,10 +106,8 @@ def tip_orientation(normal: npt.ArrayLike, heading_rad: float) -> FloatArray:
     heading = np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
     x = heading - np.sum(z * heading, axis=-1, keepdims=True) * z
     length = np.linalg.norm(x, axis=-1, keepdims=True)
-    if not np.all(length > 1e-6):
-        raise ValueError(
-            f"heading_rad: got {heading_rad:g}, along a normal; accepted is across all of them"
-        )
+    across = bool(np.all(length > 1e-6))
+    require(across, "heading_rad", heading_rad, "a direction that is not along a normal")
     x = x / length
     frame = np.stack([x, np.cross(z, x), z], axis=-1)  # (..., 3, 3), columns are the axes
     quaternions = Rotation.from_matrix(frame.reshape(-1, 3, 3)).as_quat()

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.fields import require
 from tactile_resonance.poles.result import ellipse, ellipse_radius
 from tactile_resonance.record import Origin
 from tactile_resonance.scan.adaptive import known_points
@@ -82,15 +83,10 @@ class MapPoint:
     def of_tip(cls, result: PointResult, origin: Origin) -> MapPoint:
         """Shown where the tip was, along its +z; ``ValueError`` where that is not known."""
         contact = origin.contact
-        if contact.position_m is None:
-            raise ValueError(
-                f"tip_pose of measurement {origin.measurement_id}: got none; accepted is a pose in a frame"
-            )
-        if not np.all(np.isfinite([*contact.position_m, *contact.orientation_xyzw])):
-            raise ValueError(
-                f"tip_pose of measurement {origin.measurement_id}: got {contact.position_m}, "
-                f"{contact.orientation_xyzw}; accepted are finite numbers"
-            )
+        pose = contact.position_m and (*contact.position_m, *contact.orientation_xyzw)
+        known = pose is not None and bool(np.all(np.isfinite(pose)))
+        where = f"tip_pose of measurement {origin.measurement_id}"
+        require(known, where, pose, "finite numbers, of a frame")
         normal = Rotation.from_quat(contact.orientation_xyzw).as_matrix()[:, 2]
         return cls(result, np.array(contact.position_m), normal)
 

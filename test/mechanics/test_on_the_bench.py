@@ -41,7 +41,7 @@ def test_the_command_reads_a_file_and_needs_to_know_what_holds_the_ball(tmp_path
     np.savetxt(path, columns, delimiter=",", header="time_s,force_n,indentation_m", comments="")
     command = ["mechanics", str(path), "--radius-m", "2.5e-3"]
     assert cli.main(command) == 1
-    assert "--stiffness-n-per-m: got None with --rigid False" in capsys.readouterr().err
+    assert "--stiffness-n-per-m: got None; accepted is one of it and --rigid" in capsys.readouterr().err
     out, plot = tmp_path / "out.json", tmp_path / "out.png"
     given = ["--stiffness-n-per-m", str(record.ball.stiffness_n_per_m)]
     assert cli.main([*command, *given, "--json", str(out), "--plot", str(plot)]) == 0

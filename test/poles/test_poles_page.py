@@ -29,5 +29,5 @@ def test_only_poles_has_parts():
     parser = argparse.ArgumentParser()
     benchmark.add_parser(parser.add_subparsers())
     options = parser.parse_args(["benchmark", "frf", "--part", "grid"])
-    with pytest.raises(ValueError, match="--part: grid is a table of `benchmark poles`"):
+    with pytest.raises(ValueError, match="--part: got 'grid'; accepted is with poles only"):
         options.run(options)

@@ -186,7 +186,7 @@ def test_what_nobody_reads_is_not_excited():
     assert "distortion is not wanted" in saved
     asked = scene([[0, 0]])
     asked = replace(asked, sensor=replace(asked.sensor, band_high_hz=2e4))
-    with pytest.raises(ValueError, match="200 to 20000 Hz; accepted is within 10 to 10000"):
+    with pytest.raises(ValueError, match=r"got \(200.0, 20000.0\); accepted is within 10 to 10000"):
         design_measurement(asked)
 
 
@@ -204,7 +204,7 @@ def test_several_bands_are_excited_and_nothing_between_them():
     assert (slow.sample_rate_hz, slow.samples, slow.block_s) == (10e3, 8000, 0.8)
     assert slow.lines == 97  # of 1.25 Hz, eight on either side
     coarse = replace(asked.sensor, samples_per_period=1000)
-    with pytest.raises(ValueError, match="sensor: got 3 excited lines in the band 200 to 300 Hz, 50 Hz apart"):
+    with pytest.raises(ValueError, match="sensor: excited lines from 200 to 300 Hz: got 3; .*50 Hz apart"):
         design_measurement(replace(asked, sensor=coarse))
     with pytest.raises(ValueError, match="further_bands: .*accepted is bands that do not overlap"):
         replace(asked.sensor, further_bands=(PoleBand(250.0, 400.0),))

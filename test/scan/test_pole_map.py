@@ -226,7 +226,7 @@ def test_the_same_numbers_in_two_frames_are_two_places():
 
 
 def test_no_pose_is_refused_and_no_pole_is_a_failure():
-    with pytest.raises(ValueError, match="tip_pose of measurement 3: got none"):
+    with pytest.raises(ValueError, match="tip_pose of measurement 3: got None; accepted is finite numbers"):
         map_point(poles(), Origin(measurement_id=3))
     failed = map_point(Poles(status=PolesStatus.NO_RESONANCE, message="none in band"), origin())
     elsewhere = replace(failed.result, measurement_id=99, x_m=1.0)
