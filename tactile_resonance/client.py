@@ -35,6 +35,8 @@ from tactile_resonance.nodes.goals import (
 from tactile_resonance.nodes.running import NEW_POINT_RESULTS, STEADY
 
 TICK_S = 0.1
+ANSWERS_WITHIN_S = 10.0
+"""Of scan_node, which answers at once: longer means that it has ended or hangs."""
 
 
 class Ending(Enum):
@@ -185,7 +187,7 @@ class TactileClient:
         self._node = node
         prefix = f"{namespace.rstrip('/')}/" if namespace else ""
         # of its own: a callback of the caller that awaits would keep all others of its group waiting
-        group = MutuallyExclusiveCallbackGroup()
+        self._group = group = MutuallyExclusiveCallbackGroup()
         self._scans = GoalClient(node, Scan, f"{prefix}scan", callback_group=group)
         name = f"{prefix}calibrate_table"
         self._calibrations = GoalClient(node, CalibrateTable, name, callback_group=group)
@@ -325,7 +327,10 @@ class TactileClient:
                 ClientGoalHandle(client, UUID(), None).cancel_goal_async()  # without an id: all goals
 
     def pause(self) -> Future:
-        """Wait with the tip free once the point under way is finished; as all below, a `Trigger.Response`."""
+        """Wait with the tip free once the point under way is finished; as all below, a `Trigger.Response`.
+
+        ``success`` is False too where no answer comes within 10 s; whether it was done is not known then.
+        """
         return self._call("pause")
 
     def resume(self) -> Future:
@@ -411,11 +416,21 @@ class TactileClient:
 
     def _call(self, name: str) -> Future:
         service = self._services[name]
-        if service.service_is_ready():
-            return service.call_async(Trigger.Request())
-        answer = Future()
-        answer.set_result(Trigger.Response(success=False, message="no scan_node is there"))
-        return answer
+        if not service.service_is_ready():
+            answer = Future()
+            answer.set_result(Trigger.Response(success=False, message="no scan_node is there"))
+            return answer
+        request = service.call_async(Trigger.Request())
+
+        def give_up() -> None:  # in the group of the service, which takes no answer meanwhile
+            if not request.done():
+                text = f"scan_node does not answer, for {ANSWERS_WITHIN_S:g} s"
+                request.set_result(Trigger.Response(success=False, message=text))
+
+        group = self._group
+        timer = self._node.create_timer(ANSWERS_WITHIN_S, give_up, callback_group=group, clock=STEADY)
+        request.add_done_callback(lambda _: self._node.destroy_timer(timer))
+        return request
 
     def _on_point(self, message: PointResult) -> None:
         asked = self._asked

@@ -361,6 +361,25 @@ def test_a_node_that_hangs_is_not_said_to_be_absent(stack, monkeypatch):
     assert told == (Ending.REJECTED, "scan_node does not answer, for 0.3 s")
 
 
+@pytest.mark.parametrize("name", ["pause", "resume", "skip", "repeat"])
+def test_a_request_that_a_node_does_not_answer_is_given_up(stack, monkeypatch, name):
+    monkeypatch.setattr(client_module, "ANSWERS_WITHIN_S", 0.3)
+    stack.activate()
+    stack.until(stack.client._services["pause"].service_is_ready)
+    stack.until(stack.client._services["repeat_point"].service_is_ready)
+    request = getattr(stack.client, name)()
+    assert spin_until(stack.executor, request.done, 10.0)  # scan_node does not spin
+    told = request.result().success, request.result().message
+    assert told == (False, "scan_node does not answer, for 0.3 s")
+    assert not list(stack.user.timers)[1:]  # the client's own alone
+    # an answer that is late changes nothing, and the next request has its own
+    monkeypatch.setattr(client_module, "ANSWERS_WITHIN_S", 60.0)
+    again = getattr(stack.client, name)()
+    stack.until(again.done)
+    assert again.result().message == "no scan is running"
+    assert request.result().message == told[1]
+
+
 def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     monkeypatch.setattr(goals, "GONE_S", 1.0)
     stack.activate()
