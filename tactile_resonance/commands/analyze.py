@@ -198,7 +198,7 @@ def _run(options: argparse.Namespace) -> int:
         print(found.text())
         return 0
     order, residual_terms = options.order, DEFAULT_RESIDUAL_TERMS
-    if (options.record / "run.json").is_file():
+    if (band_hz is None or order is None) and (options.record / "run.json").is_file():
         from tactile_resonance.scan.reidentify import scene_band
 
         of_scene = scene_band(options.record)

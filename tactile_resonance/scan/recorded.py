@@ -84,11 +84,14 @@ def measurement_at(run: Path, point: int) -> int:
     Raises
     ------
     ValueError
-        If it is no run, or the point is not of it or has no measurement.
+        If it is no run, or the point is not of it or has no measurement, or its file is damaged.
     """
     content = read_run(run)
     measured = {r.index + 1: r.measurement_id for r in content.latest if r.measurement_id}
     if point not in measured:
+        damaged = [text for text in content.problems if text.startswith(f"point-{point - 1:05d}-")]
+        if damaged:
+            raise ValueError(f"point: {point}, {'; '.join(damaged)}")
         known = ", ".join(map(str, sorted(measured))) or "none"
         raise ValueError(f"point: {point}, measured points of {run} are {known}")
     return measured[point]

@@ -41,7 +41,7 @@ from tactile_resonance.scan.kept_bins import (
     write_array,
 )
 from tactile_resonance.scan.point_result import MODE
-from tactile_resonance.scan.run_content import read_plan
+from tactile_resonance.scan.run_content import SCENE, read_index, read_plan
 from tactile_resonance.scan.scene import SensorUse
 
 STATUS = "poles_status"
@@ -63,10 +63,13 @@ def scene_band(run: Path) -> PoleBand:
     Raises
     ------
     ValueError
-        If its scene cannot be read.
+        If its scene cannot be read, or is no longer that of the scan.
     """
-    path = run / "scene.yaml"
+    path = run / SCENE
     where = f"{path}:"
+    entry = read_index(run)[0].get(SCENE)
+    if entry is not None and (damage := entry.damage(path)):
+        raise ValueError(f"{where} {damage}; expected as it was, for the band and the order that are not given")
     content = read_yaml(path)
     sensor = section(content, "sensor", where) if "sensor" in content else {}
     return read_dataclass(SensorUse, sensor, f"{where} sensor").bands[0]
@@ -126,11 +129,11 @@ def reidentify(
     """
     for run in runs:
         read_plan(run)
-    wanted = [scene_band(run) for run in runs]
-    bands = [band_hz or band.ends_hz for band in wanted]
+    of_scene = lru_cache(scene_band)
+    bands = [band_hz or of_scene(run).ends_hz for run in runs]
     structures = [
-        structure or ModelStructure.with_residual(band.order or 2, band.residual_terms)
-        for band in wanted
+        structure or ModelStructure.with_residual(of_scene(run).order or 2, of_scene(run).residual_terms)
+        for run in runs
     ]
     dtype = row_type(max(each.order // 2 for each in structures))
     counts, left_out = Counter[str](), list[str]()

@@ -106,6 +106,32 @@ def test_band_and_model_are_those_of_the_scene(tmp_path, capsys):
     assert "--order" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["analyze", "reidentify"])
+def test_a_scene_that_was_changed_gives_neither_band_nor_model(tmp_path, capsys, command):
+    """What is left of one that was cut short is a scene too, of another band."""
+    run = make_run(tmp_path / "run", [list(measurement(100))])
+    (run / "scene.yaml").write_text("name: x\n")
+    point = ["--point", "1"] if command == "analyze" else []
+    for given in ([], ["--band", "210", "290"], ["--order", "2"]):
+        assert main([command, str(run), *point, *given]) == 1
+        told = capsys.readouterr().err
+        assert f"scene.yaml: has 8 bytes, {len(SCENE)} when it was finished; expected as it was" in told
+    assert main([command, str(run), *point, "--band", "210", "290", "--order", "2"]) == 0
+
+
+def test_a_point_whose_file_is_damaged_is_not_said_to_be_unmeasured(tmp_path, capsys):
+    run = make_run(tmp_path / "run", [list(measurement(100 + k)) for k in range(2)])
+    file = run / "recording" / "point-00000-00.mcap"
+    file.write_bytes(file.read_bytes()[:1000])
+    assert main(["analyze", str(run), "--point", "1"]) == 1
+    told = capsys.readouterr().err
+    assert "point (--point): 1, point-00000-00.mcap: has 1000 bytes, " in told
+    file.unlink()
+    assert main(["analyze", str(run), "--point", "1"]) == 1
+    assert "point-00000-00.mcap: finished, but no longer there" in capsys.readouterr().err
+    assert main(["analyze", str(run), "--point", "2"]) == 0
+
+
 @pytest.mark.parametrize("order", [2, 4])
 def test_the_poles_are_those_of_analyze(runs, tmp_path, capsys, order):
     output = tmp_path / "again"
