@@ -172,7 +172,9 @@ class _Records:
             "responses of sensor over actuator at which a fit can begin: are channels swapped, is the sample "
             "rate right?"
         )
-        require(bool(np.isfinite(self.residual(start)).all()), "records", names, accepted)
+        with np.errstate(invalid="ignore"):
+            begins = bool(np.isfinite(self.residual(start)).all())
+        require(begins, "records", names, accepted)
         # there are no bounds: a QR of the long Jacobian is enough, "trf" takes its singular values
         found = optimize.least_squares(
             residual, np.zeros(scale.size), jacobian, x_scale="jac", method="lm", max_nfev=steps

@@ -140,10 +140,12 @@ def start_in_air(
     natural, damping, strength = _peaks(s, sharp, modes, record.name or "air")
     # far above the modes G is gamma over 1 + a little; where it is not, the fit corrects
     gamma = float(np.clip(np.median(g.real[-max(3, g.size // 50) :]), 1e-3, 0.5))
+    with np.errstate(invalid="ignore"):  # a strength below 0 is no sensor's: NaN, from which no fit begins
+        coupling_rad_s = np.sqrt(strength * (1 - gamma))
     return SensorModel(
         natural_rad_s=natural,
         damping_ratio=damping,
-        coupling_rad_s=np.sqrt(strength * (1 - gamma)),
+        coupling_rad_s=coupling_rad_s,
         tip_deflection=np.zeros(natural.size),
         feedthrough=np.array(gamma),
         leak_rad_s=np.array(0.1 * abs(s[0])),

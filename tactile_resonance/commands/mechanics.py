@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from tactile_resonance.scan.tissue_tests import TissueTest
 
 COLUMNS = ("time_s", "force_n", "indentation_m")
+LARGEST_RADIUS_M = 0.1
+"""Of a ball: a number beyond it is of millimetres."""
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -99,6 +101,8 @@ def _read(path: Path, options: argparse.Namespace) -> IndentationRecord:
     from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 
     require(options.radius_m is not None, "--radius-m", None, "the radius of the ball [m]")
+    accepted = f"metres, at most {LARGEST_RADIUS_M:g}: 1.5 mm are 1.5e-3"
+    require(options.radius_m <= LARGEST_RADIUS_M, "--radius-m", options.radius_m, accepted)
     spring = options.stiffness_n_per_m
     accepted = "one of it and --rigid: behind a spring the indentation is not fixed while the stage is held"
     require(options.rigid == (spring is None), "--stiffness-n-per-m", spring, accepted)

@@ -144,7 +144,7 @@ def test_masses_that_contradict_each_other_are_declared_and_make_the_tip_uncerta
     assert np.abs(off).max() < 4
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.filterwarnings("error")
 def test_channels_that_are_swapped_are_refused_by_name(records):
     swapped = [
         replace(record, frf=replace(record.frf, g=1 / record.frf.g))

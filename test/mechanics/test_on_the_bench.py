@@ -60,6 +60,10 @@ def test_the_command_reads_a_file_and_needs_to_know_what_holds_the_ball(tmp_path
     # what a run holds would be written anew: wrong options are refused before anything is read
     assert cli.main([*command, "--rigid", "--terms", "0"]) == 1
     assert capsys.readouterr().err.endswith("most_terms: got 0; accepted is 1 to 6\n")
+    in_millimetres = ["mechanics", str(path), "--radius-m", "2.5", "--rigid"]
+    assert cli.main(in_millimetres) == 1
+    told = capsys.readouterr().err
+    assert told.endswith("--radius-m: got 2.5; accepted is metres, at most 0.1: 1.5 mm are 1.5e-3\n")
     # in millimetres: what comes of it is said with its digits
     for name, of in (("mm", 1.0), ("nan", np.nan)):
         path = tmp_path / f"{name}.npz"
