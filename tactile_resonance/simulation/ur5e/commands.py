@@ -11,9 +11,9 @@ from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
 from tactile_resonance.simulation.ur5e import motion
 from tactile_resonance.simulation.ur5e.command_loop import Command, CommandLoop
 from tactile_resonance.simulation.ur5e.forces import ForceTask, ToolPayload
-from tactile_resonance.simulation.ur5e.kinematics import Posture
+from tactile_resonance.simulation.ur5e.kinematics import Posture, product
 from tactile_resonance.simulation.ur5e.machine import Machine
-from tactile_resonance.simulation.ur5e.poses import Six, pose_from_transform, product
+from tactile_resonance.simulation.ur5e.poses import Six, pose_from_transform
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError, Thread
 from tactile_resonance.simulation.ur5e.variables import Registers
 
@@ -100,6 +100,11 @@ class Program(CommandLoop):
         """End what is done again and again, and stop."""
         self.kill(name)
         return (motion.stopl if linear else motion.stopj)(self._target, deceleration)
+
+    def _speed(self, run: Callable[..., Thread]) -> None:
+        """Bring joints or TCP to speeds."""
+        *speeds, acceleration, time_s = self.doubles(0, 8)
+        self._keep("speed", run, tuple(speeds), acceleration, time_s)
 
     def _servo(self, goal: Six) -> None:
         """Follow joint angles."""
@@ -224,7 +229,7 @@ class Program(CommandLoop):
     def _all_commands(self) -> dict[int, Command]:
         """What the client's program does, by the number of the command."""
         machine, target = self._machine, self._target
-        pose, double, doubles, keep, ended = self.pose, self.double, self.doubles, self._keep, self._ended
+        pose, double, doubles, ended = self.pose, self.double, self.doubles, self._ended
 
         def one(answer: Callable[[], int]) -> Callable[[], None]:
             return lambda: self.answer(answer())
@@ -240,8 +245,8 @@ class Program(CommandLoop):
             6: self._force_mode,
             7: self._end_force_mode,
             8: machine.sensor.zero,
-            9: lambda: keep("speed", motion.speedj, doubles(), double(6), double(7)),
-            10: lambda: keep("speed", motion.speedl, doubles(), double(6), double(7)),
+            9: lambda: self._speed(motion.speedj),
+            10: lambda: self._speed(motion.speedl),
             11: lambda: self._servo(doubles()),
             15: lambda: ended("speed", double(0), linear=self._asked["speed"][0] is motion.speedl),
             16: lambda: ended("servo", double(0)),

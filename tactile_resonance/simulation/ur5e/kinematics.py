@@ -16,11 +16,11 @@ from __future__ import annotations
 
 import math
 
-from numba import float64, njit
+from numba import boolean, float64, njit
 from numba.types import UniTuple
 
 from tactile_resonance.contact.vectors import Vector, cross
-from tactile_resonance.simulation.ur5e.poses import IDENTITY, Six, Transform, product
+from tactile_resonance.simulation.ur5e.poses import IDENTITY, Six, Transform
 
 # Figures of the table. Lengths in m; the twists alpha are 90, 0, 0, 90, -90 and 0 degrees.
 D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
@@ -29,6 +29,28 @@ D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
 _EDGE = 1e-9
 
 _3, _6, _9, _12 = (UniTuple(float64, n) for n in (3, 6, 9, 12))
+
+
+@njit(_12(_9, _3, _9, _3), cache=True)
+def _product(a, a_m, b, b_m):
+    """See `product`."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = a
+    b0, b1, b2, b3, b4, b5, b6, b7, b8 = b
+    (x, y, z), (bx, by, bz) = a_m, b_m
+    return (
+        a0 * b0 + a1 * b3 + a2 * b6, a0 * b1 + a1 * b4 + a2 * b7, a0 * b2 + a1 * b5 + a2 * b8,
+        a3 * b0 + a4 * b3 + a5 * b6, a3 * b1 + a4 * b4 + a5 * b7, a3 * b2 + a4 * b5 + a5 * b8,
+        a6 * b0 + a7 * b3 + a8 * b6, a6 * b1 + a7 * b4 + a8 * b7, a6 * b2 + a7 * b5 + a8 * b8,
+        x + (a0 * bx + a1 * by + a2 * bz),
+        y + (a3 * bx + a4 * by + a5 * bz),
+        z + (a6 * bx + a7 * by + a8 * bz),
+    )  # fmt: skip
+
+
+def product(a: Transform, b: Transform) -> Transform:
+    """Return the transform of `b` as seen from the frame in which `a` is given."""
+    numbers = _product(*a, *b)
+    return numbers[:9], numbers[9:]
 
 
 @njit(UniTuple(float64, 24)(_6), cache=True)
@@ -85,7 +107,7 @@ def _twist(numbers, point_m, qd):
 
 @njit(_6(_12, _3, _6), cache=True)
 def _speeds(numbers, point_m, twist):
-    """See `Posture.speeds`; not finite at a singularity."""
+    """Return the joint speeds [rad/s] of a twist of a point, the inverse of `_twist`; NaN at a singularity."""
     s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = numbers
     vx, vy, vz, ox, oy, oz = twist
     # A2 A3 sin(q3): 0 where the elbow is stretched; r4: where the wrist is above the shoulder
@@ -114,6 +136,13 @@ def _speeds(numbers, point_m, twist):
 class Posture:
     """The arm at one set of joint angles.
 
+    Parameters
+    ----------
+    q : tuple of 6 float
+        Joint angles [rad].
+    numbers : tuple of 24 float, optional
+        Of the same posture, where `motion_to` or `motion_towards` has told them.
+
     Attributes
     ----------
     q : tuple of 6 float
@@ -124,9 +153,10 @@ class Posture:
 
     __slots__ = ("_numbers", "_tools", "flange", "q")
 
-    def __init__(self, q: Six) -> None:
+    def __init__(self, q: Six, numbers: tuple | None = None) -> None:
         self.q = q
-        numbers = _posture(q)
+        if numbers is None:
+            numbers = _posture(q)
         self.flange: Transform = numbers[:9], numbers[9:12]
         self._numbers = numbers[12:]
         self._tools: list[tuple[Transform, Transform]] = [(IDENTITY, self.flange)]
@@ -151,11 +181,6 @@ class Posture:
             Speeds of the joints [rad/s].
         """
         return _twist(self._numbers, point_m, qd)
-
-    def speeds(self, point_m: Vector, twist: Six) -> Six | None:
-        """Return the joint speeds [rad/s] of a twist, the inverse of `twist`; None at a singularity."""
-        speeds = _speeds(self._numbers, point_m, twist)
-        return speeds if math.isfinite(sum(speeds)) else None
 
     def torques(self, point_m: Vector, wrench: Six) -> Six:
         """Return the torques [N m] of the joints that a wrench [N, N m] at a point in the base exerts."""
@@ -274,3 +299,96 @@ def nearest_inverse(flange: Transform, near: Six, joint_range_rad: float = math.
     """
     *joints, way = _nearest(*flange, near, joint_range_rad)
     return tuple(joints) if way < math.inf else None
+
+
+@njit(UniTuple(float64, 37)(_9, _3, _6, _6, float64, _9, _3, _9, _3), cache=True)
+def motion_to(turn, place_m, twist, near, joint_range_rad, tcp, tcp_m, back, back_m):
+    """Return the motion of the joints that brings a TCP to a place with a twist, as numbers.
+
+    Parameters
+    ----------
+    turn, place_m : 9 floats, 3 floats
+        Of the TCP in the base.
+    twist : 6 floats
+        Its velocity [m/s] and angular velocity [rad/s] in the base.
+    near, joint_range_rad : 6 floats, float
+        See `nearest_inverse`.
+    tcp, tcp_m, back, back_m : 9 floats, 3 floats, twice
+        The TCP in the flange, and the flange in it.
+
+    Returns
+    -------
+    37 floats
+        Joint angles [rad] (6), numbers of their `Posture` (24), joint speeds [rad/s] (6), NaN at a singularity;
+        how far the angles are from `near` [rad], infinite out of reach.
+    """
+    flange = _product(turn, place_m, back, back_m)
+    found = _nearest(flange[:9], flange[9:], near, joint_range_rad)
+    numbers = _posture(found[:6])
+    point_m = _product(numbers[:9], numbers[9:12], tcp, tcp_m)[9:]
+    return found[:6] + numbers + _speeds(numbers[12:], point_m, twist) + found[6:]
+
+
+@njit
+def _turned(turn, x, y, z):
+    """Return a turn that is turned further by a rotation vector in the base (Rodrigues' formula)."""
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle == 0.0:
+        return turn
+    # 1 - cos(angle) by half the angle: the difference has no digits left where the angle is small
+    half = math.sin(angle / 2) / angle
+    sine, versine = 2 * half * math.cos(angle / 2), 2 * half * half
+    sx, sy, sz, vx, vy, vz = sine * x, sine * y, sine * z, versine * x, versine * y, versine * z
+    further = (
+        1.0 - vy * y - vz * z, vx * y - sz, vx * z + sy,
+        vx * y + sz, 1.0 - vx * x - vz * z, vy * z - sx,
+        vx * z - sy, vy * z + sx, 1.0 - vx * x - vy * y,
+    )  # fmt: skip
+    nowhere = (0.0, 0.0, 0.0)
+    return _product(further, nowhere, turn, nowhere)[:9]
+
+
+@njit(UniTuple(float64, 38)(*[_6] * 3, *[float64] * 2, boolean, float64, *[_9, _3] * 2), cache=True)
+def motion_towards(
+    q, qd, goal, most, period_s, straight, joint_range_rad, tcp, tcp_m, back, back_m
+):  # fmt: skip
+    """Return the motion of the joints that brings the twist of a TCP nearer to a goal in a period.
+
+    Parameters
+    ----------
+    q, qd : 6 floats
+        Of the joints at its beginning [rad], [rad/s].
+    goal : 6 floats
+        Velocity [m/s] and angular velocity [rad/s] in the base.
+    most, period_s : float
+        Largest change of the velocity [m/s], numerically that of the angular velocity too; the period.
+    straight : bool
+        Moving and turning end together, so that the path is kept.
+    joint_range_rad, tcp, tcp_m, back, back_m
+        See `motion_to`.
+
+    Returns
+    -------
+    38 floats
+        As of `motion_to`, and last whether the goal is reached.
+    """
+    numbers = _posture(q)
+    tool = _product(numbers[:9], numbers[9:12], tcp, tcp_m)
+    vx, vy, vz, ox, oy, oz = _twist(numbers[12:], tool[9:], qd)
+    x, y, z, rx, ry, rz = goal
+    moving = math.sqrt((x - vx) * (x - vx) + (y - vy) * (y - vy) + (z - vz) * (z - vz))
+    turning = math.sqrt((rx - ox) * (rx - ox) + (ry - oy) * (ry - oy) + (rz - oz) * (rz - oz))
+    reached = moving <= most and turning <= most
+    if not reached:
+        longest = max(moving, turning)
+        move = most / max(longest if straight else moving, most)
+        turn = most / max(longest if straight else turning, most)
+        x, y, z = vx + (x - vx) * move, vy + (y - vy) * move, vz + (z - vz) * move
+        rx, ry, rz = ox + (rx - ox) * turn, oy + (ry - oy) * turn, oz + (rz - oz) * turn
+    mean_s = period_s / 2
+    turned = _turned(tool[:9], (ox + rx) * mean_s, (oy + ry) * mean_s, (oz + rz) * mean_s)
+    px, py, pz = tool[9:]
+    place = (px + (vx + x) * mean_s, py + (vy + y) * mean_s, pz + (vz + z) * mean_s)
+    twist = (x, y, z, rx, ry, rz)
+    found = motion_to(turned, place, twist, q, joint_range_rad, tcp, tcp_m, back, back_m)
+    return found + (1.0 if reached else 0.0,)

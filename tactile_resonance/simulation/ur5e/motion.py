@@ -228,23 +228,7 @@ def _step_twist(target: Target, goal: Six, acceleration: float, straight: bool =
     if not any(goal) and not any(target.qd):
         target.stay()
         return True
-    vx, vy, vz, ox, oy, oz = target.twist
-    x, y, z, rx, ry, rz = goal
-    allowed = acceleration * CYCLE_S
-    moving, turning = math.dist((x, y, z), (vx, vy, vz)), math.dist((rx, ry, rz), (ox, oy, oz))
-    reached = moving <= allowed and turning <= allowed
-    if not reached:
-        # when stopping, moving and turning end together, so that the path is kept
-        longest = max(moving, turning)
-        move = allowed / max(longest if straight else moving, allowed)
-        turn = allowed / max(longest if straight else turning, allowed)
-        x, y, z = vx + (x - vx) * move, vy + (y - vy) * move, vz + (z - vz) * move
-        rx, ry, rz = ox + (rx - ox) * turn, oy + (ry - oy) * turn, oz + (rz - oz) * turn
-    mean_s = CYCLE_S / 2
-    shift = ((vx + x) * mean_s, (vy + y) * mean_s, (vz + z) * mean_s)
-    rotation = ((ox + rx) * mean_s, (oy + ry) * mean_s, (oz + rz) * mean_s)
-    target.command_tool(turned(target.tool, shift, rotation), (x, y, z, rx, ry, rz))
-    return reached
+    return target.command_towards(goal, acceleration, straight=straight)
 
 
 def _step_joints(target: Target, goal: Six, acceleration: float) -> bool:

@@ -6,9 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from operator import add, sub
 
-from numba import float64, njit
-from numba.types import UniTuple
-
 from tactile_resonance.contact.vectors import (
     NO_TURN,
     Turn,
@@ -67,28 +64,6 @@ def transform_from_pose(pose: Iterable[float]) -> Transform:
 def pose_from_transform(transform: Transform) -> Six:
     """Return place [m] and rotation vector [rad] of a transform."""
     return *transform[1], *vector_from_turn(transform[0])
-
-
-def product(a: Transform, b: Transform) -> Transform:
-    """Return the transform of `b` as seen from the frame in which `a` is given."""
-    numbers = _product(*a, *b)
-    return numbers[:9], numbers[9:]
-
-
-@njit(UniTuple(float64, 12)(*[UniTuple(float64, 9), UniTuple(float64, 3)] * 2), cache=True)
-def _product(a, a_m, b, b_m):
-    """See `product`; compiled, since a simulated robot does this several times a cycle."""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = a
-    b0, b1, b2, b3, b4, b5, b6, b7, b8 = b
-    (x, y, z), (bx, by, bz) = a_m, b_m
-    return (
-        a0 * b0 + a1 * b3 + a2 * b6, a0 * b1 + a1 * b4 + a2 * b7, a0 * b2 + a1 * b5 + a2 * b8,
-        a3 * b0 + a4 * b3 + a5 * b6, a3 * b1 + a4 * b4 + a5 * b7, a3 * b2 + a4 * b5 + a5 * b8,
-        a6 * b0 + a7 * b3 + a8 * b6, a6 * b1 + a7 * b4 + a8 * b7, a6 * b2 + a7 * b5 + a8 * b8,
-        x + (a0 * bx + a1 * by + a2 * bz),
-        y + (a3 * bx + a4 * by + a5 * bz),
-        z + (a6 * bx + a7 * by + a8 * bz),
-    )  # fmt: skip
 
 
 def inverse_transform(transform: Transform) -> Transform:

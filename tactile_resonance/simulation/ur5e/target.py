@@ -9,7 +9,13 @@ from dataclasses import dataclass
 from operator import sub
 
 from tactile_resonance.contact.vectors import NO_TURN, Turn, Vector, transposed, turn_product
-from tactile_resonance.simulation.ur5e.kinematics import Posture, nearest_inverse
+from tactile_resonance.simulation.ur5e.kinematics import (
+    Posture,
+    motion_to,
+    motion_towards,
+    nearest_inverse,
+    product,
+)
 from tactile_resonance.simulation.ur5e.poses import (
     IDENTITY,
     ORIGIN,
@@ -20,7 +26,6 @@ from tactile_resonance.simulation.ur5e.poses import (
     inverse_transform,
     largest,
     pose_from_transform,
-    product,
     rounded,
     total,
     turned,
@@ -169,11 +174,20 @@ class Target:
 
     def command_tool(self, tool: Transform, twist: Six) -> None:
         """Set the target TCP and its twist for this cycle; raises as `command`."""
-        posture = self._solved(tool)
-        qd = posture.speeds(posture.tool(self._tcp)[1], twist)
-        if qd is None:
-            raise ProtectiveStop("the path leads through a singularity")
-        self._command(posture, qd)
+        self._command(*self._motion_to(tool, twist))
+
+    def command_towards(self, goal: Six, acceleration: float, *, straight: bool) -> bool:
+        """Bring the target twist nearer to a goal in this cycle, and say whether it is there.
+
+        Acceleration [m/s^2], numerically that of turning too [rad/s^2]; when stopping `straight`, moving and
+        turning end together. Raises as `command`.
+        """
+        numbers = motion_towards(
+            *(self.q, self.qd, goal, acceleration * CYCLE_S, CYCLE_S, straight),
+            *(self.limits.joint_range_rad, *self._tcp, *self._flange_in_tcp),
+        )
+        self._command(*_motion(numbers, self.tool))
+        return numbers[-1] > 0
 
     def stay(self) -> None:
         """Stand still in this cycle, where the arm stands already; raises as `command`."""
@@ -184,7 +198,7 @@ class Target:
         """Move the target TCP aside by a compliance, beside what the program commands."""
         before = self.tool
         aside = turned(before, shift_m, turn_rad)
-        posture = self._solved(aside)
+        posture, _ = self._motion_to(aside, ZERO)
         self._check(posture)
         self.yielded_q = total(self.yielded_q, difference(posture.q, self.q))
         x, y, z = self.yielded_m
@@ -212,14 +226,14 @@ class Target:
         flange = product(tool, self._flange_in_tcp)
         return nearest_inverse(flange, q_near, self.limits.joint_range_rad)
 
-    def _solved(self, tool: Transform) -> Posture:
-        """Return the posture for a TCP in the base, nearest to the present one."""
-        q = self.solve(tool, self.q)
-        if q is None:
-            raise ProtectiveStop(f"no joint angles reach the position {rounded(tool[1])} m")
-        return Posture(q)
+    def _motion_to(self, tool: Transform, twist: Six) -> tuple[Posture, Six]:
+        """Return posture and speeds of the joints for a TCP in the base, nearest to the present ones."""
+        near = self.q, self.limits.joint_range_rad
+        return _motion(motion_to(*tool, twist, *near, *self._tcp, *self._flange_in_tcp), tool)
 
     def _command(self, posture: Posture, qd: Six) -> None:
+        if not math.isfinite(sum(qd)):
+            raise ProtectiveStop("the path leads through a singularity")
         self._require_turn()
         self._check(posture, qd)
         self.commanded, self.posture, self.qd = True, posture, qd
@@ -243,6 +257,13 @@ class Target:
                     f"joint {joint} would turn at {fastest:.2f} rad/s, "
                     f"above its limit of {limits.joint_speed_rad_s:.2f} rad/s"
                 )
+
+
+def _motion(numbers: tuple[float, ...], tool: Transform) -> tuple[Posture, Six]:
+    """Return what `motion_to` found for a place of the TCP, or near it."""
+    if numbers[36] == math.inf:
+        raise ProtectiveStop(f"no joint angles reach the position {rounded(tool[1])} m")
+    return Posture(numbers[:6], numbers[6:30]), numbers[30:36]
 
 
 def rate(before: Six, now: Six) -> Six:

@@ -12,7 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.ur5e import kinematics
 from tactile_resonance.simulation.ur5e.kinematics import Posture
-from tactile_resonance.simulation.ur5e.poses import pose_from_transform, transform_from_pose
+from tactile_resonance.simulation.ur5e.poses import (
+    inverse_transform,
+    pose_from_transform,
+    transform_from_pose,
+)
 
 sys.path.insert(0, str(Path(__file__).parent))
 from matrices import floats, forward, matrix, matrix_from_pose, transform, turn_between
@@ -153,16 +157,67 @@ def test_twist_is_the_derivative_of_a_tool_point(postures):
             np.testing.assert_allclose(twist, [*velocity, *turn], atol=1e-8)
 
 
-def test_speeds_are_the_inverse_of_twist_and_torques_do_the_same_work(postures):
+TCP = transform_from_pose([0.02, -0.05, 0.13, 0.4, 0.1, -0.2])
+TCPS = (*TCP, *inverse_transform(TCP))
+
+
+def posture_at(motion):
+    """Posture, its joint speeds and how far it is, of `motion_to` or `motion_towards`."""
+    return Posture(motion[:6], motion[6:30]), np.array(motion[30:36]), motion[36]
+
+
+def test_a_motion_of_the_tool_is_that_of_the_joints_and_torques_do_the_same_work(postures):
     rng = np.random.default_rng(10)
     for q in postures:
         posture = Posture(floats(q))
-        point = floats(posture.flange[1] + rng.uniform(-0.2, 0.2, 3))
+        point = posture.tool(TCP)[1]
         qd, wrench = floats(rng.standard_normal(6)), floats(rng.standard_normal(6))
         twist = posture.twist(point, qd)
-        np.testing.assert_allclose(posture.speeds(point, twist), qd, atol=1e-8)
+        near = floats(q + 1e-3)
+        found, speeds, away = posture_at(
+            kinematics.motion_to(*posture.tool(TCP), twist, near, np.pi * 2, *TCPS)
+        )
+        np.testing.assert_allclose(found.q, q, atol=1e-8)
+        np.testing.assert_allclose(matrix(found.flange), matrix(posture.flange), atol=1e-9)
+        np.testing.assert_allclose(speeds, qd, atol=1e-6)
+        assert away == pytest.approx(6e-3, rel=1e-4)
         torques = posture.torques(point, wrench)
         assert np.dot(torques, qd) == pytest.approx(np.dot(wrench, twist), abs=1e-12)
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_a_twist_comes_nearer_to_its_goal_and_the_tool_moves_by_the_mean_of_both(
+    postures, straight
+):
+    postures, rng = postures.copy(), np.random.default_rng(11)
+    period_s, most = 1e-3, 5e-3
+    for q in postures[:100]:
+        q[[2, 4]] = 1.5 + 0.2 * q[[2, 4]]  # away from the edges of its reach
+        posture, qd = Posture(floats(q)), floats(0.1 * rng.standard_normal(6))
+        tool = posture.tool(TCP)
+        before = np.array(posture.twist(tool[1], qd))
+        for size in (0.5 * most, 10 * most):
+            way = rng.standard_normal(6)
+            way[:3] *= size / np.linalg.norm(way[:3])
+            way[3:] *= 0.5 * size / np.linalg.norm(way[3:])
+            motion = kinematics.motion_towards(
+                *(floats(q), qd, floats(before + way), most, period_s, straight, np.pi * 2, *TCPS)
+            )
+            found, speeds, away = posture_at(motion)
+            assert away < 0.1
+            reached = size <= most
+            assert motion[37] == reached
+            if not reached:
+                way[:3] *= most / size
+                way[3:] *= most / size if straight else most / (0.5 * size)
+            place = found.tool(TCP)
+            now = np.array(found.twist(place[1], floats(speeds)))
+            np.testing.assert_allclose(now, before + way, atol=1e-9)
+            mean = (before + now) / 2 * period_s
+            np.testing.assert_allclose(np.subtract(place[1], tool[1]), mean[:3], atol=1e-9)
+            np.testing.assert_allclose(
+                turn_between(matrix(tool), matrix(place)), mean[3:], atol=1e-9
+            )
 
 
 @pytest.mark.parametrize(("joint", "angle"), [(2, 0.0), (4, 0.0)])
@@ -170,8 +225,8 @@ def test_at_a_singularity_no_speeds_are_found(joint, angle):
     q = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.3])
     q[joint] = angle
     q[1] = 0.0
-    posture = Posture(floats(q))
-    assert posture.speeds(posture.flange[1], (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)) is None
+    posture, upwards = Posture(floats(q)), (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+    assert np.isnan(kinematics._speeds(posture._numbers, posture.flange[1], upwards)).all()
 
 
 def test_a_frame_that_the_flange_carries_is_the_product(postures):

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_resonance.simulation.ur5e.kinematics import product
 from tactile_resonance.simulation.ur5e.poses import (
     inverse_transform,
     pose_from_transform,
-    product,
     transform_from_pose,
     turn_between,
     turned,
