@@ -12,7 +12,6 @@ import stat
 import subprocess
 import sys
 import tempfile
-import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -86,38 +85,18 @@ def read_arrays(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]
 
 def _read_npz(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
     try:
-        with zipfile.ZipFile(path) as archive:
-            # of two of one name that with the suffix counts, as numpy has it
-            infos = sorted(archive.infolist(), key=lambda info: info.filename.endswith(".npy"))
-            members = {info.filename.removesuffix(".npy"): info for info in infos}
-            held = {name: info for name, info in members.items() if name in wanted}
-            most = max((info.file_size for info in held.values()), default=0)
-            if most > MOST_BYTES:
-                raise ValueError(f"an array of {most / 1e9:.1f} GB, accepted are 4 GiB")
-            arrays = {name: _array(archive, info) for name, info in held.items()}
-        return {name: a for name, a in arrays.items() if a.dtype.kind in _NUMBERS}, list(members)
+        with np.load(path) as archive:
+            names = list(dict.fromkeys(archive.files))
+            for info in archive.zip.infolist():
+                held = info.filename.removesuffix(".npy") in wanted
+                if held and info.file_size > MOST_BYTES:
+                    size = f"{info.file_size / 1e9:.1f} GB"
+                    raise ValueError(f"an array of {size}, accepted are 4 GiB")
+            # what a header promises beyond its member is never touched: numpy ends where that does
+            arrays = {name: np.asarray(archive[name]) for name in names if name in wanted}
+        return {name: a for name, a in arrays.items() if a.dtype.kind in _NUMBERS}, names
     except Exception as error:  # whatever zipfile and numpy meet in a damaged file
         raise ValueError(f"{path.name}: no .npz record ({one_line(error)[:120]})") from error
-
-
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """One array; what its header promises is compared with what is there before memory is taken."""
-    with archive.open(member) as file:
-        version = np.lib.format.read_magic(file)
-        header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }
-        if version not in header:
-            raise ValueError(f"array format {version}")
-        shape, _, dtype = header[version](file)
-        promised = int(np.prod(shape, dtype=float)) * dtype.itemsize
-        if promised > member.file_size:
-            raise ValueError(
-                f"{member.filename} promises {promised} bytes and holds {member.file_size}"
-            )
-    with archive.open(member) as file:
-        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
 def _read_mat(path: Path, wanted: Collection[str]) -> tuple[Arrays, list[str]]:
