@@ -195,9 +195,12 @@ class TriangleMesh(Surface):
 
     def at(self, xy_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(...) height [m] and (..., 3) upward unit normal of the topmost face, NaN beside the mesh."""
+        from trimesh.triangles import points_to_barycentric  # of the extra `mesh`
+
         xy = np.asarray(xy_m, float)
         points = xy.reshape(-1, 2)
         triangles = self.corners_m[self.faces]  # (t, 3, 3)
+        flat = triangles * [1.0, 1.0, 0.0]
         low, high = triangles[..., :2].min(axis=1), triangles[..., :2].max(axis=1)  # (t, 2)
         margin = _INSIDE * float(np.max(np.ptp(self.corners_m, axis=0)))
         heights, normals = np.full(len(points), np.nan), np.full((len(points), 3), np.nan)
@@ -205,7 +208,9 @@ class TriangleMesh(Surface):
             near = np.flatnonzero(
                 np.all((point >= low - margin) & (point <= high + margin), axis=1)
             )
-            weights = _barycentric(triangles[near, :, :2], point)  # (k, 3)
+            places = np.broadcast_to([*point, 0.0], (near.size, 3))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                weights = points_to_barycentric(flat[near], places, method="cross")  # (k, 3), exact on slivers
             hit = np.all(weights >= -_INSIDE, axis=1)  # NaN of upright faces: no hit
             if not hit.any():
                 continue
@@ -257,20 +262,6 @@ def read_stl(path: Path) -> FloatArray:
     corners = np.asarray(mesh.triangles, float)
     require(len(corners) > 0, "file", str(path), "STL, binary or text, with a triangle or more")
     return corners
-
-
-def _barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
-    """(k, 3) weights of the corners of (k, 3, 2) triangles at a point (2,); NaN for upright faces."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-
-    def area(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
-        u, v = q - p, r - p
-        return np.asarray(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
-
-    whole = area(a, b, c)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weights = np.stack([area(b, c, point), area(c, a, point), area(a, b, point)], axis=1)
-        return np.where(whole[:, None] == 0, np.nan, weights / whole[:, None])
 
 
 @dataclass(frozen=True)
