@@ -47,7 +47,7 @@ class Ending(Enum):
     CANCELLED = "cancelled"  # on request
     REJECTED = "rejected"  # the goal was not accepted
     REFUSED = "refused"  # it was, and no point could be begun, or the touches determine no table
-    LOST = "lost"  # scan_node went away
+    LOST = "lost"  # scan_node went away, or the client was destroyed
 
 
 @dataclass(frozen=True)
@@ -346,13 +346,16 @@ class TactileClient:
         return self._call("repeat_point")
 
     def destroy(self) -> None:
-        """Take everything off the node again; a scan under way goes on, and is followed no longer."""
+        """Take everything off the node again; a scan under way goes on, and its future is done as `LOST`."""
         self._node.destroy_timer(self._timer)
         self._node.destroy_subscription(self._points)
         for service in self._services.values():
             self._node.destroy_client(service)
         self._scans.destroy()
         self._calibrations.destroy()
+        asked, self._asked = self._asked, None
+        if asked is not None:
+            asked.future.set_result(asked.lost("its client was destroyed"))
 
     def _begin(self, asked: AskedGoal) -> Future:
         if self._asked is not None:

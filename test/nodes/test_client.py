@@ -399,6 +399,19 @@ def test_a_scan_whose_node_goes_away_is_lost(stack, monkeypatch):
     assert outcome.points == heard[-1].points
 
 
+def test_a_client_that_is_destroyed_leaves_no_future_undone(stack):
+    stack.activate()
+    other, heard = TactileClient(stack.user), []
+    future = other.scan(**GOAL, run_directory=stack.folder / "run", on_feedback=heard.append)
+    stack.until(lambda: heard and heard[-1].phase == Scan.Feedback.PHASE_WAITING)
+    other.destroy()
+    outcome = stack.ended(future)
+    assert (outcome.ending, outcome.run_directory) == (Ending.LOST, str(stack.folder / "run"))
+    assert outcome.message.startswith("its client was destroyed, 0 of 1 points were finished")
+    # the scan goes on, and keeps others out
+    assert stack.ended(stack.client.scan(**GOAL)).message == RUNNING
+
+
 @pytest.mark.parametrize("kind", [ScanOutcome, CalibrationOutcome])
 def test_a_goal_whose_node_goes_away_before_a_run_is_lost_without_one(kind):
     asked = client_module.AskedGoal(None, kind, None, wait_s=1.0, on_feedback=None)
