@@ -26,15 +26,15 @@ from tactile_resonance.poles.data import BinData, rough_noise, with_noise
 from tactile_resonance.poles.fit import Linearised
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.joint_fit import noise_of_moving_modes
-from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.likelihood import moments
-from tactile_resonance.poles.modes import propagated
+from tactile_resonance.poles.model import propagated
 from tactile_resonance.poles.noise_level import ROUNDED
 from tactile_resonance.poles.result import (
     Poles,
     PolesBatch,
     PolesStatus,
     natural_frequency_and_damping_jacobian,
+    single,
 )
 
 # How often a constant mode is found to change.

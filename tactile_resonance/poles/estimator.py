@@ -21,9 +21,8 @@ from tactile_resonance.frf.result import FRF, BandBins, FrfStatus
 from tactile_resonance.poles.drift import poles_with_drift
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator, whole_harmonics
-from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.noise_level import channels_of, two_channels
-from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
+from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.poles.tones import has_tones, poles_without_tones
 

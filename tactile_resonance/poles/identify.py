@@ -13,7 +13,7 @@ from scipy import special
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import band, number, require, require_kind
 from tactile_resonance.frf.result import FRF, FrfStatus
-from tactile_resonance.poles.judgement import Judged, assemble, single
+from tactile_resonance.poles.judgement import Judged, assemble
 from tactile_resonance.poles.lacking import FEWEST_OF_A_LINE, Lack
 from tactile_resonance.poles.lines import (
     LinesPlan,
@@ -21,10 +21,14 @@ from tactile_resonance.poles.lines import (
     lines_of_frf,
     lines_of_spectra,
 )
-from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY, are_smooth, systematic_of
-from tactile_resonance.poles.modes import in_any_direction
 from tactile_resonance.poles.noise_level import KINDS, ROUNDED, not_counted, student_variance
-from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus
+from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus, single
+from tactile_resonance.poles.significance import (
+    MODEL_ERROR_PROBABILITY,
+    are_smooth,
+    in_any_direction,
+    systematic_of,
+)
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
 from tactile_resonance.poles.tones import poles_of_lines_without_tones
 
@@ -67,7 +71,7 @@ def identify_frf(
     where a test allows it. Where both are known, ``covariance`` propagates the noise through these
     weights and ``total_covariance`` the total; where only realisations are at hand, noise cannot be
     distinguished from distortion and both fields hold both. Where the cost exceeds what the variance
-    explains, ``total_covariance`` holds the model error too; see `model_error.model_error_factor`.
+    explains, ``total_covariance`` holds the model error too; see `significance.model_error_factor`.
     """
     if np.ndim(frf.g) != 1:
         raise ValueError(

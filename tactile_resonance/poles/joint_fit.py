@@ -22,7 +22,6 @@ from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
 from tactile_resonance.poles.levels import Levels, Spread, level_of, noise_at_modes
 from tactile_resonance.poles.likelihood import Solution, moments
-from tactile_resonance.poles.model_error import are_smooth, systematic_of
 from tactile_resonance.poles.noise_level import (
     ROUNDED,
     TINY,
@@ -32,6 +31,7 @@ from tactile_resonance.poles.noise_level import (
     smooth_variance,
     student_variance,
 )
+from tactile_resonance.poles.significance import are_smooth, systematic_of
 from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.likelihood import Solution
 from tactile_resonance.poles.model import PolynomialBasis
-from tactile_resonance.poles.model_error import are_smooth
 from tactile_resonance.poles.noise_level import DOUBT
+from tactile_resonance.poles.significance import are_smooth
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan

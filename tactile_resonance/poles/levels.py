@@ -25,7 +25,6 @@ from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntAr
 from tactile_resonance.poles.data import BINS_PER_BAND, BinData
 from tactile_resonance.poles.likelihood import Solution, half_inverse, invert, moments, sandwich
 from tactile_resonance.poles.model import real_rows
-from tactile_resonance.poles.model_error import MODEL_ERROR_PROBABILITY
 from tactile_resonance.poles.noise_level import (
     CHANCE,
     Pieces,
@@ -36,6 +35,7 @@ from tactile_resonance.poles.noise_level import (
     student_variance,
 )
 from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
+from tactile_resonance.poles.significance import MODEL_ERROR_PROBABILITY
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The identified transfer function: poles, zeros, residues, response, and their derivatives.
+"""The identified transfer function: poles, zeros, residues, response, their derivatives and covariance.
 
 Its polynomials have real coefficients over bases that are orthonormal on the lines of the band: powers of s
 over a narrow band are all but parallel; a basis orthonormal on the data makes the same polynomials well
@@ -17,7 +17,11 @@ import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles.compiled import entry
+from tactile_resonance.poles.result import natural_frequency_and_damping
 from tactile_resonance.poles.structure import ModelStructure
+
+# A mode this fraction of the band outside of it is still one that the lines show.
+BAND_MARGIN = 0.1
 
 
 @dataclass(frozen=True)
@@ -325,6 +329,111 @@ def _residues_and_sensitivity(
                 value[i + 1] = new / hessenberg_b[i + 1, i]
                 above += value[i + 1] * numerator[point, i + 1]
             residues[point, k] = above * factor
+
+
+def modes_in_band(poles_rad_s: ComplexArray, band_hz: tuple[float, float]) -> ComplexArray:
+    """Of each complex pair near the band the pole above the real axis, by natural frequency.
+
+    Parameters
+    ----------
+    poles_rad_s : (..., n) complex
+    band_hz : (low, high)
+
+    Returns
+    -------
+    (..., n // 2) complex
+        NaN from the last mode on.
+    """
+    margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
+    n = poles_rad_s.shape[-1]
+    poles = poles_rad_s.reshape(-1, n)
+    found = np.full((len(poles), n // 2), complex(np.nan, np.nan))
+    _in_band(poles, band_hz[0] - margin, band_hz[1] + margin, found)
+    return found.reshape(*poles_rad_s.shape[:-1], n // 2)
+
+
+@entry
+def _in_band(poles, low_hz, high_hz, found):
+    """Of poles (points, n) those above the real axis in a band, by natural frequency, into (points, n // 2)."""
+    points, n = poles.shape
+    f0_hz = np.empty(n // 2)
+    for point in range(points):
+        count = 0
+        for pole in poles[point]:
+            size_hz = np.abs(pole) / (2 * np.pi)
+            if pole.imag > 0 and low_hz <= size_hz <= high_hz and count < n // 2:
+                k = count
+                while k > 0 and f0_hz[k - 1] > size_hz:
+                    f0_hz[k], found[point, k] = f0_hz[k - 1], found[point, k - 1]
+                    k -= 1
+                f0_hz[k], found[point, k] = size_hz, pole
+                count += 1
+
+
+def propagated(
+    poles: ComplexArray, sensitivity: ComplexArray, parameters: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (points, k, 2, 2) of (Re, Im) of poles (points, k), and of (f0_hz, damping_ratio).
+
+    From derivatives of the poles (points, k, p) by the first p coefficients, of covariance (points, n, n).
+    """
+    of_poles, in_f0 = np.empty((2, *poles.shape, 2, 2))
+    _propagate(poles, sensitivity, parameters, of_poles, in_f0)
+    return of_poles, in_f0
+
+
+@entry
+def _propagate(poles, sensitivity, parameters, of_poles, in_f0):
+    """Put what `propagated` gives into the last two."""
+    points, count, p = sensitivity.shape
+    for point in range(points):
+        for k in range(count):
+            rr = ri = ii = 0.0
+            for i in range(p):
+                to_re = to_im = 0.0
+                for j in range(p):
+                    value = sensitivity[point, k, j]
+                    to_re += parameters[point, i, j] * value.real
+                    to_im += parameters[point, i, j] * value.imag
+                value = sensitivity[point, k, i]
+                rr += value.real * to_re
+                ri += value.real * to_im
+                ii += value.imag * to_im
+            of_poles[point, k, 0, 0], of_poles[point, k, 1, 1] = rr, ii
+            of_poles[point, k, 0, 1] = of_poles[point, k, 1, 0] = ri
+            # rows of `natural_frequency_and_damping_jacobian`
+            re, im = poles[point, k].real, poles[point, k].imag
+            size = np.sqrt(re * re + im * im)
+            a, b = re / (2 * np.pi * size), im / (2 * np.pi * size)
+            c, d = -im * im / size**3, re * im / size**3
+            in_f0[point, k, 0, 0] = a * a * rr + 2 * a * b * ri + b * b * ii
+            in_f0[point, k, 1, 1] = c * c * rr + 2 * c * d * ri + d * d * ii
+            both = a * c * rr + (a * d + b * c) * ri + b * d * ii
+            in_f0[point, k, 0, 1] = in_f0[point, k, 1, 0] = both
+
+
+def pole_quantities(
+    model: RationalModel, band_hz: tuple[float, float], parameters: FloatArray
+) -> tuple[dict[str, npt.NDArray], ComplexArray]:
+    """Poles in the band and what follows from them, by the names that `PolesBatch` gives them.
+
+    With a covariance (points, n, n) of the free coefficients, those of the denominator first. And the
+    derivatives (points, k, n) of the poles by these.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        poles = modes_in_band(model.poles_rad_s(), band_hz)
+        f0_hz, damping_ratio = natural_frequency_and_damping(poles)
+        residues, sensitivity = model.residues_and_sensitivity(poles)
+        of_poles, in_f0 = propagated(poles, sensitivity, parameters)
+        quantities = {
+            "poles_rad_s": poles,
+            "f0_hz": f0_hz,
+            "damping_ratio": damping_ratio,
+            "residues": residues,
+            "pole_covariance": of_poles,
+            "covariance": in_f0,
+        }
+    return quantities, sensitivity
 
 
 def real_covariance(sensitivity: ComplexArray, parameters: FloatArray) -> FloatArray:

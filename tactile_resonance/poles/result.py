@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an identification holds."""
+"""What an identification holds: of one point, with a sentence for people, or of a batch."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING
@@ -15,6 +16,9 @@ from tactile_resonance.poles.structure import ModelStructure
 
 if TYPE_CHECKING:  # compiled, which nodes that only pass poles on need not wait for
     from tactile_resonance.poles.model import RationalModel
+
+# Of the variance of a delay by what is not known of other coefficients: beyond it, its deviation means little.
+MOST_INFLATION = 100.0
 
 
 class PolesStatus(Enum):
@@ -114,7 +118,7 @@ class Poles:
         the variance is unknown.
     whiteness : float
         How much smoother the residuals are than those of noise, as a normal score: see
-        `model_error.whiteness`. NaN where it was not computed.
+        `significance.whiteness`. NaN where it was not computed.
     condition_number : float
         Of the column-scaled Jacobian, to within a factor of the number of parameters; NaN where
         there is none.
@@ -297,8 +301,8 @@ class PolesBatch:
 
     @property
     def whiteness(self) -> FloatArray:
-        """(...) how much smoother the residuals are than white ones; see `model_error.whiteness`."""
-        from tactile_resonance.poles.model_error import whiteness  # compiled, too
+        """(...) how much smoother the residuals are than white ones; see `significance.whiteness`."""
+        from tactile_resonance.poles.significance import whiteness  # compiled, too
 
         return whiteness(self.residual, self.structure.parameters)
 
@@ -309,6 +313,146 @@ class PolesBatch:
     def status(self, index: tuple[int, ...] | int = ()) -> PolesStatus:
         """Status of one point."""
         return STATUSES[int(self.status_code[index])]
+
+
+def single(batch: PolesBatch, index: tuple[int, ...] = (), notes: Sequence[str] = ()) -> Poles:
+    """One point of a batch, with the sentence a batch leaves out.
+
+    Parameters
+    ----------
+    batch : PolesBatch
+    index : tuple of int
+        Into its leading axes.
+    notes : sequence of str
+        Added to the message.
+    """
+    model = batch.fit.at(index)
+    status = batch.status(index)
+    there = np.isfinite(batch.poles_rad_s[index])
+    poles = batch.poles_rad_s[index][there]
+    coefficients = batch.coefficient_covariance[index]
+    real = batch.significant[index][there]
+    left_out = [
+        f"what the fit took for a mode at {abs(pole) / (2 * np.pi):.4g} Hz is no more than "
+        "noise makes"
+        for pole in poles[~real]
+    ]
+    there[there] = real
+    terms = batch.structure.numerator_order - batch.structure.order + 1
+    from_what = f"{terms} residual terms" if terms > 1 else "the numerator"
+    not_told = f"the delay is not told from {from_what}: its own value and deviation mean little"
+    untold = batch.structure.delay and there.any() and (terms > 1 or _inflation(coefficients) > MOST_INFLATION)
+    of_delay = [not_told] if untold else []
+    notes = [*left_out, *of_delay, *notes]
+
+    def optional(array: FloatArray) -> FloatArray | None:
+        values = array[index][there]
+        return values if values.size and np.isfinite(values).all() else None
+
+    said = [_sentence(batch, index, status), *notes, str(batch.remark[index])]
+    message = "; ".join(filter(None, said))
+    return Poles(
+        poles_rad_s=poles[real],
+        f0_hz=batch.f0_hz[index][there],
+        damping_ratio=batch.damping_ratio[index][there],
+        residues=batch.residues[index][there],
+        covariance=optional(batch.covariance),
+        total_covariance=optional(batch.total_covariance),
+        pole_covariance=optional(batch.pole_covariance),
+        coefficient_covariance=coefficients if np.isfinite(coefficients).all() else None,
+        structure=batch.structure,
+        band_hz=batch.band_hz,
+        lines=int(batch.lines[index]),
+        cost=float(batch.cost[index]),
+        expected_cost=float(batch.expected_cost[index]),
+        whiteness=float(batch.whiteness[index]),
+        condition_number=float(batch.condition_number[index]),
+        variance_model=str(batch.variance_model[index]),
+        fit=None if status is PolesStatus.TOO_FEW_LINES else model,
+        method=batch.method,
+        status=status,
+        message=message,
+    )
+
+
+def _inflation(covariance: FloatArray) -> float:
+    """Variance of the last coefficient over what it would be if the others (n, n) were known; NaN: unknown."""
+    if not np.isfinite(covariance).all():
+        return float("nan")
+    std = np.sqrt(np.diagonal(covariance))
+    return float(np.linalg.pinv(covariance / np.outer(std, std), hermitian=True)[-1, -1])
+
+
+def _sentence(batch: PolesBatch, index: tuple[int, ...], status: PolesStatus) -> str:
+    if status is PolesStatus.OK:
+        return ""
+    low_hz, high_hz = batch.band_hz
+    structure = batch.structure
+    sentences = {
+        PolesStatus.TOO_FEW_LINES: f"{int(batch.lines[index])} lines with finite values in "
+        f"{low_hz:g}-{high_hz:g} Hz, "
+        f"{structure.parameters} parameters need at least {structure.fewest_lines}",
+        PolesStatus.NOT_CONVERGED: "the iterations found no minimum",
+        PolesStatus.ILL_CONDITIONED: f"condition number {batch.condition_number[index]:.2g}: the "
+        "lines do not determine the model",
+        PolesStatus.NO_RESONANCE: f"no complex pole pair in {low_hz:g}-{high_hz:g} Hz",
+        PolesStatus.UNSTABLE_POLE: "a pole in the right half plane: the sensor is passive, so the "
+        "model is wrong",
+        PolesStatus.NO_COVARIANCE: _without_covariance(batch, index),
+        PolesStatus.MODEL_ERROR: f"{_contradiction(batch, index)}: the model leaves something out"
+        + (", rely on the total covariance" if _has_total(batch, index) else ""),
+    }
+    return sentences.get(status, "")
+
+
+def _has_total(batch: PolesBatch, index: tuple[int, ...]) -> bool:
+    return bool(np.isfinite(batch.total_covariance[index]).any())
+
+
+def _without_covariance(batch: PolesBatch, index: tuple[int, ...]) -> str:
+    """Why there is none."""
+    if np.isfinite(batch.cost[index]):
+        if _has_total(batch, index):
+            return "no line has a finite variance of the noise alone: the total covariance is known"
+        return (
+            "the variance of each line has too few degrees of freedom to estimate the uncertainty: "
+            "record more periods or realisations"
+        )
+    if not _has_total(batch, index):
+        return (
+            "the fit leaves too few degrees of freedom to estimate the noise: take a wider band, more "
+            "periods or a smaller order"
+        )
+    return (
+        "the variance is not known independently of the fit: a model error would not show unless it "
+        "is smooth"
+    )
+
+
+def _contradiction(batch: PolesBatch, index: tuple[int, ...]) -> str:
+    """What noise alone would not make."""
+    from tactile_resonance.poles.significance import SMOOTH_RESIDUAL  # compiled, too
+
+    found = []
+    chi_square, parameters, f0_hz = batch.lacking[index]
+    if np.isfinite(chi_square):
+        what = (
+            f"one mode more near {f0_hz:.4g} Hz fits"
+            if np.isfinite(f0_hz)
+            else ("two residual terms more fit")
+        )
+        found.append(f"{what} better: chi-square {chi_square:.0f} for {parameters:.0f} parameters")
+    if batch.cost[index] > batch.expected_cost[index]:
+        found.append(
+            f"cost {batch.cost[index]:.4g} where the variance explains "
+            f"{batch.expected_cost[index]:.4g}"
+        )
+    if batch.whiteness[index] > SMOOTH_RESIDUAL:
+        found.append(
+            f"residuals smooth over the lines (whiteness {batch.whiteness[index]:.1f} where "
+            f"noise makes {SMOOTH_RESIDUAL} at most)"
+        )
+    return ", ".join(found) or "realisations contradict each other"
 
 
 def natural_frequency_and_damping(pole: ComplexArray) -> tuple[FloatArray, FloatArray]:

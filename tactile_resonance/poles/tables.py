@@ -37,13 +37,7 @@ from tactile_resonance.poles.likelihood import (
     Rules,
     Solution,
 )
-from tactile_resonance.poles.model import PolynomialBasis, RationalModel, Variable
-from tactile_resonance.poles.modes import (
-    modes_in_band,
-    pole_quantities,
-    second_order,
-    significant_modes,
-)
+from tactile_resonance.poles.model import PolynomialBasis, RationalModel, Variable, modes_in_band
 from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -357,21 +351,3 @@ class FitPlan(ABC):
         if self.structure.order >= SEVERAL_MODES:
             solution = best_of_split(self, data, solution)
         return self, solution
-
-    def with_covariance(self, data: BinData) -> tuple[ComplexArray, FloatArray]:
-        """Poles (points, places) of a fit, in the band or not, and their covariance as its residuals show it.
-
-        That is (points, places, 2, 2) of (f0_hz, damping_ratio); NaN where the data do not determine the mode.
-        """
-        plan, solution = self.batched(data)
-        own, n = plan.problem.sizes[2], solution.theta.shape[-1]
-        free = data.records * own + n - own
-        dof = max(data.records * data.order.size - free / 2, 1)
-        covariance = solution.marginal[:, 0] * (solution.cost / (2 * dof))[:, None, None]
-        model = plan.model_of(solution.theta[:, 0])
-        quantities, _ = pole_quantities(model, (0.0, np.inf), covariance)
-        poles, in_f0 = quantities["poles_rad_s"], quantities["covariance"]
-        lines = np.full(solution.cost.size, int(dof))
-        _, distance = significant_modes(model, quantities, covariance, lines)
-        in_f0[~((np.linalg.det(in_f0) > 0) & (in_f0[..., 0, 0] > 0))] = np.nan  # lost to rounding
-        return poles, in_f0 + second_order(poles, np.isfinite(poles), distance)

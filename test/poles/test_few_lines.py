@@ -12,8 +12,7 @@ from benchmarks.poles_plant import HARMONICS, SAMPLE_RATE_HZ, SAMPLES_PER_PERIOD
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.judgement import single
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure
 
 STRUCTURES = [ModelStructure(), ModelStructure(2, 2), ModelStructure(1, 1), ModelStructure(4, 9)]

@@ -20,10 +20,9 @@ from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import minimise
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.lacking import DOUBT, FALSE_ALARM, Lack
 from tactile_resonance.poles.lines import LinesPlan
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)

@@ -12,9 +12,8 @@ from scipy import stats
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.identify import identify_batch, identify_frf
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.judgement import single
 from tactile_resonance.poles.model import PolynomialBasis
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure
 
 

@@ -18,14 +18,14 @@ from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.model_error import (
+from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.significance import (
     SMOOTH_RESIDUAL,
     are_smooth,
     correlation_length,
     model_error_factor,
     whiteness,
 )
-from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)

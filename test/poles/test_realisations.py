@@ -21,8 +21,7 @@ from benchmarks.poles_plant import (
 )
 from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.judgement import single
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)

@@ -17,8 +17,8 @@ from tactile_resonance.poles.identify import (
     identify_frf,
     identify_spectra,
 )
-from tactile_resonance.poles.model_error import SMOOTH_RESIDUAL
 from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.significance import SMOOTH_RESIDUAL
 from tactile_resonance.poles.structure import ModelStructure
 
 BARE = ModelStructure(2, 2)

@@ -8,8 +8,7 @@ from scipy import stats
 from tactile_resonance.frf.result import FRF
 from tactile_resonance.poles.identify import identify_batch
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.judgement import single
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure
 
 RATE_HZ, SAMPLES, PERIODS, HARMONICS = 5000.0, 2000, 4, np.arange(4, 601)

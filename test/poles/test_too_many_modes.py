@@ -22,8 +22,7 @@ from scipy import stats
 
 from tactile_resonance.poles.identify import identify_batch, identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator
-from tactile_resonance.poles.judgement import single
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure
 
 RUNS = 100

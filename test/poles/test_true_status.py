@@ -26,8 +26,7 @@ from tactile_resonance.poles.identify import (
     identify_frf,
     identify_spectra,
 )
-from tactile_resonance.poles.judgement import single
-from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.result import PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure
 
 
