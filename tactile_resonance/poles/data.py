@@ -16,6 +16,7 @@ import numpy.typing as npt
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.likelihood import FEWEST_PIECES, TINY, Rules
 from tactile_resonance.poles.noise_level import (
+    BINS_PER_BAND,
     FALSE_ALARM,
     Pieces,
     are_flat,
@@ -28,8 +29,6 @@ from tactile_resonance.poles.noise_level import (
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
 
-# Bins whose powers are averaged before their variances are compared with each other.
-BINS_PER_BAND = 8
 # Disturbances that the response explains somewhat are taken for the generator's, unless one gain for all
 # bins leaves so much less of the error.
 MUCH_MORE = 1.5

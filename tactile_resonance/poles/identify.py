@@ -21,14 +21,15 @@ from tactile_resonance.poles.lines import (
     lines_of_frf,
     lines_of_spectra,
 )
-from tactile_resonance.poles.noise_level import KINDS, ROUNDED, not_counted, student_variance
-from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus, single
-from tactile_resonance.poles.significance import (
+from tactile_resonance.poles.noise_level import (
+    KINDS,
     MODEL_ERROR_PROBABILITY,
-    are_smooth,
-    in_any_direction,
-    systematic_of,
+    ROUNDED,
+    not_counted,
+    student_variance,
 )
+from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus, single
+from tactile_resonance.poles.significance import are_smooth, in_any_direction, systematic_of
 from tactile_resonance.poles.structure import ModelStructure, checked_structure
 from tactile_resonance.poles.tones import poles_of_lines_without_tones
 

@@ -16,18 +16,21 @@ import numpy as np
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.estimate import disagreement
-from tactile_resonance.poles.data import BINS_PER_BAND, BinData, rules_between, with_noise
+from tactile_resonance.poles.data import BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
-from tactile_resonance.poles.levels import Levels, Spread, level_of, noise_at_modes
+from tactile_resonance.poles.levels import Levels, Spread
 from tactile_resonance.poles.likelihood import Solution, moments
 from tactile_resonance.poles.noise_level import (
+    BINS_PER_BAND,
     ROUNDED,
     TINY,
     Pieces,
     are_flat,
+    level_of,
     line_pieces,
+    noise_at_modes,
     smooth_variance,
     student_variance,
 )
@@ -181,7 +184,7 @@ class _Round:
         return moments(self.plan.problem.tables, changed, self.solution.theta)[2][:, :, 1]
 
     def at_modes(self, scale: FloatArray) -> FloatArray:
-        """(batch,) factor of the covariance from noise of this level; see `levels.noise_at_modes`."""
+        """(batch,) factor of the covariance from noise of this level; see `noise_level.noise_at_modes`."""
         factor = np.ones(scale.size)
         rows = np.flatnonzero((self.kind > 0) & _may_return(self.solution))
         if rows.size and self.data.undriven:  # one level for all flat bins is known well enough

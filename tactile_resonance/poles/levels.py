@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Levels of noise and distortion that a fit to records shows, and whether records contradict the model.
+"""Levels of noise and distortion that a fit to realisations shows, and whether these contradict the model.
 
 An error of the model is an error of the response: turned by the phase of the input it is the same in
 every realisation. Noise and stochastic nonlinear distortion differ (Pintelon & Schoukens, *System
@@ -22,20 +22,16 @@ import numpy.typing as npt
 from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.data import BINS_PER_BAND, BinData
+from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.likelihood import Solution, half_inverse, invert, moments, sandwich
 from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.noise_level import (
     CHANCE,
+    MODEL_ERROR_PROBABILITY,
     Pieces,
-    at_modes,
-    chance_of_level,
     chance_of_pieces,
-    not_counted,
-    student_variance,
 )
 from tactile_resonance.poles.result import natural_frequency_and_damping_jacobian
-from tactile_resonance.poles.significance import MODEL_ERROR_PROBABILITY
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan
@@ -47,96 +43,6 @@ DISTORTION_PROBABILITY = 1e-2
 FEWEST_RECORDS = 4
 # Share of errors (f0, damping) within the ellipse.
 INSIDE = 0.95
-
-
-def level_of(
-    plan: JointPlan, solution: Solution, noise: FloatArray, by_piece: BoolArray
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:
-    """Noise level that a fit of points of one record each shows, and whether it contradicts the model.
-
-    Without bins between harmonics it is from the residuals, and a model error hides in it unless they
-    are smooth. With such bins these give the level, and the excited ones whether the model holds.
-
-    Weighted with are mean variances of Y and U of `noise` (batch, 2), where `by_piece` (batch,) from each of
-    the pieces of the band alone.
-
-    Returns
-    -------
-    scale : (batch,) float
-        Level that covariances are of, in units of the variances weighted with.
-    cost, expected, suspect, noise
-        See `judgement.Judged`.
-    correction : (batch,) float
-        Factor of the covariance for a level that is not known exactly, and for noise on excited lines alone.
-    """
-    batch, _, n = solution.theta.shape
-    lines, others = plan.excited_at.size, plan.others_at.size
-    if others == 0:
-        dof = np.full(batch, max(lines - n / 2, 0.5))
-        scale, nothing = solution.cost / dof, np.full(batch, np.nan)
-        no = np.zeros(batch, bool)
-        return scale, nothing, nothing, no, noise * scale[:, None], student_variance(dof)
-    used = solution.leverage[:, 0]
-    dof_o = others - used / 2
-    dof_e = lines - (n - used) / 2
-    dof = dof_e + dof_o
-    level = solution.part_cost[:, 0] / dof_o
-    cost = solution.part_cost[:, 1] / level
-    expected = dof_e * dof_o / (dof_o - 1)
-    chance = chance_of_level(cost / dof_e, dof_e, dof_o)
-    correction = student_variance(dof)
-    if by_piece.any():
-        expected = np.where(by_piece, expected * BINS_PER_BAND / (BINS_PER_BAND - 1), expected)
-        of_pieces = chance_of_pieces(cost / expected, dof_e, BINS_PER_BAND * lines / others, BINS_PER_BAND)
-        chance = np.where(by_piece, of_pieces, chance)
-        correction = np.where(by_piece, BINS_PER_BAND / (BINS_PER_BAND - 2), correction)
-    suspect = chance < MODEL_ERROR_PROBABILITY
-    scale = np.where(suspect, level, solution.part_cost.sum(axis=-1) / dof)
-    correction = correction * not_counted(np.where(suspect, np.nan, chance), cost / expected * level / scale)
-    return scale, cost, expected, suspect, noise * level[:, None], correction
-
-
-def noise_at_modes(
-    plan: JointPlan, data: BinData, solution: Solution, scale: FloatArray, part: FloatArray | float = 1.0
-) -> FloatArray:
-    """(batch,) factor of the covariance of points; see `noise_level.at_modes`.
-
-    Each undriven bin shows the noise there, and those beside a driven one the noise on it. The records of a
-    point pool their noise. Its level is `scale` (batch,) in units of the variances of the data; of that of the
-    residuals on driven bins `part` (batch, K_e) is noise.
-    """
-    problem, first = plan.problem, data.undriven
-    (a, b, _), theta, inverse = problem.sizes, solution.theta, solution.marginal
-    alpha, beta, gamma = problem.split(theta)
-    of_a = alpha[:, :1] @ problem.denominator.T  # (batch, 1, K), the undriven bins first
-    u, numerator = np.array(data.u[..., data.order]), np.zeros((data.order.size, b), complex)
-    u[..., :first], numerator[first:] = 0, problem.numerator
-    model = (u * (beta[:, :1] @ numerator.T) + gamma @ problem.transient.T) / of_a
-    variance, weighted = data.residual_variance(problem.response(theta[:, 0])), data.variance
-    noise = part * variance
-    own = problem.transient[:first] / of_a[:, 0, :first, None]
-    taken = np.einsum("bki,bmij,bkj->bmk", own.conj(), inverse[..., a + b :, a + b :], own).real
-    free = np.maximum(1 - taken / (2 * weighted[:, None, :first]), 0.2)  # less what the transient takes
-    sample = np.abs(data.y[..., data.order[:first]] - model[..., :first]) ** 2 / free
-    sample = sample.mean(axis=1) / scale[:, None]
-    each = first / plan.excited_at.size
-    away = np.abs(plan.excited_at[:, None] - plan.others_at)
-    beside = np.argsort(away, axis=1, kind="stable")[:, : max(2, 2 * round(each / 2))]
-    of_y = weighted[:, first:] - (variance - noise)  # noise on Y alone
-    on_lines = 1 + (sample[:, beside].mean(axis=-1) - of_y) / noise
-    ratio = np.concatenate([sample / weighted[:, :first], on_lines], axis=-1)
-    weighted[:, first:] = variance
-    poles = plan.poles_in_band(theta[:, 0])
-    sensitivity = plan.model_of(theta[:, 0]).residues_and_sensitivity(poles)[1]
-    moved = real_rows(sensitivity)[:, None] @ inverse[:, :, None, :a]  # (batch, M, places, 2, n)
-    by_bin = (moved[..., a : a + b] @ numerator.T) * u[:, :, None, None]
-    by_bin = by_bin + moved[..., a + b :] @ problem.transient.T
-    by_bin = by_bin - (moved[..., :a] @ problem.denominator[:, :a].T) * model[:, :, None, None]
-    share = np.sum(np.abs(by_bin) ** 2, axis=1) / (np.abs(of_a) ** 2 * weighted[:, None])[:, :, None]
-    share[..., first:] *= (noise / variance)[:, None, None]
-    share /= share.sum(axis=-1, keepdims=True)
-    squares = (share[..., :first] ** 2).sum(axis=-1) + (share[..., first:] ** 2).sum(axis=-1) / each
-    return at_modes((share * ratio[:, None, None]).sum(axis=-1), data.records / squares)
 
 
 @dataclass(frozen=True, eq=False)

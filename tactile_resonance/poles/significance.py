@@ -30,8 +30,6 @@ from tactile_resonance.poles.result import natural_frequency_and_damping
 if TYPE_CHECKING:
     from tactile_resonance.poles.tables import FitPlan
 
-# A cost that noise alone exceeds once in a thousand fits counts as model error.
-MODEL_ERROR_PROBABILITY = 1e-3
 # Residuals of noise alone are smoother than this once in a thousand fits.
 SMOOTH_RESIDUAL = 3.09
 # No more coefficients than this count as smooth.

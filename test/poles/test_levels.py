@@ -6,7 +6,7 @@ import pytest
 from scipy import special
 
 from tactile_resonance.frf.result import FRF
-from tactile_resonance.poles import levels
+from tactile_resonance.poles import noise_level
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import Linearised, minimise
 from tactile_resonance.poles.identify import identify_batch
@@ -34,8 +34,8 @@ def test_bins_count_as_their_noise_moves_poles(monkeypatch):
         seen["dof"] = dof
         return np.ones(len(dof))
 
-    monkeypatch.setattr(levels, "at_modes", at_modes)
-    levels.noise_at_modes(plan, data, solution, np.ones(1), part)
+    monkeypatch.setattr(noise_level, "at_modes", at_modes)
+    noise_level.noise_at_modes(plan, data, solution, np.ones(1), part)
 
     theta, own = solution.theta, plan.problem.sizes[2]
     shared = theta.shape[2] - own
