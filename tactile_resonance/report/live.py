@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -39,9 +39,6 @@ from tactile_resonance.report.page import (
 from tactile_resonance.report.point_details import MOST_DETAILED, PointDetails
 from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult, mode_columns
 from tactile_resonance.scan.pole_map import GrowingMap
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 Publish = Callable[[str, Any], None]
 HOLDING = "hold"  # state of a contact in which is measured
@@ -262,7 +259,7 @@ class LiveServer(ThreadingHTTPServer):
         self.url = f"http://{LOOPBACK}:{self.server_port}/"
         self._thread = threading.Thread(target=self.serve_forever, daemon=True)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> LiveServer:
         self._thread.start()
         return self
 

@@ -359,7 +359,7 @@ def write_map_recording(run: RunContent) -> Path | None:
                 _write(writer, f"/pole_map{name}", now_ns, message, _LATCHED)
         surface = surface_message(last, _NODE_CELLS, header_message(frame_id, now_ns))
         _write(writer, "/pole_map/surface", now_ns, surface, _LATCHED)
-        writer.finish()
+        writer.complete()
         os.replace(Path(hidden) / RECORDING, run.path / RECORDING)
     return run.path / RECORDING
 

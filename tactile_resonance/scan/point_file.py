@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from zlib import crc32
 
 from rosbags.interfaces import (
@@ -49,6 +49,9 @@ from tactile_resonance.scan.messages import (
     hash_of,
     reader_of,
 )
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 BAG_VERSION: Literal[9] = 9
 # rosbags parses the QoS of every topic of every file anew, 2 ms each: few texts differ
@@ -130,7 +133,9 @@ class _Storage(storage_mcap.McapWriter):
 
 
 class PointFileWriter:
-    """Writes one file; nobody sees it before `finish`, and then nobody loses it.
+    """Writes one file; nobody sees it before `complete`, and then nobody loses it.
+
+    A context that abandons what was not completed.
 
     Parameters
     ----------
@@ -139,6 +144,11 @@ class PointFileWriter:
         replaced.
     target : Path
         The finished file, ending in ``.mcap``; must not exist.
+
+    Attributes
+    ----------
+    newest : dict of str to bytes
+        Last message of each topic, serialised.
     """
 
     def __init__(self, hidden: Path, target: Path) -> None:
@@ -153,7 +163,14 @@ class PointFileWriter:
         # rosbags' Writer around it makes metadata of YAML, ten times the rest of a file
         self._storage = _Storage(self._folder, CompressionMode.NONE)
         self._connections: dict[str, Connection] = {}
+        self.newest: dict[str, bytes | memoryview] = {}
         self._open = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.abandon()
 
     def write(
         self,
@@ -189,6 +206,7 @@ class PointFileWriter:
         if connection.msgtype != type_name:
             raise ValueError(f"type_name: got {type_name!r}; {topic} has {connection.msgtype}")
         self._storage.write(connection, time_ns, cdr)
+        self.newest[topic] = cdr
 
     def _add(self, topic: str, type_name: str, qos: Qos | None) -> Connection:
         definition, type_hash = definition_and_hash(type_name)
@@ -208,18 +226,18 @@ class PointFileWriter:
         self._connections[topic] = connection
         return connection
 
-    def finish(self, complete: Callable[[Path, FileContent], None] | None = None) -> FileContent:
+    def complete(self, enter: Callable[[Path, FileContent], None] | None = None) -> FileContent:
         """Complete the file and give it its name, durably.
 
         Parameters
         ----------
-        complete : callable, optional
+        enter : callable, optional
             Called with the file, when all of it is on disk, and what it holds, before it gets its name.
 
         Raises
         ------
         ValueError
-            If it holds no message, or is finished already.
+            If it holds no message, or is completed already.
         OSError
             If it cannot be written.
         """
@@ -237,15 +255,15 @@ class PointFileWriter:
         written = self._folder / self._target.name
         write_checksums(written)
         sync(written)
-        if complete is not None:
-            complete(written, content)
+        if enter is not None:
+            enter(written, content)
         written.rename(self._target)
         sync(self._target.parent)
         shutil.rmtree(self._folder, ignore_errors=True)
         return content
 
     def abandon(self) -> None:
-        """Leave nothing behind; does nothing after `finish`."""
+        """Leave nothing behind; does nothing after `complete`."""
         if self._open:
             self._open = False
             self._storage.abort()

@@ -29,9 +29,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from rosbags.interfaces import Qos
+from typing import Any
 
 from tactile_resonance.fields import counted
 from tactile_resonance.files import sync, write_whole
@@ -71,9 +69,6 @@ from tactile_resonance.scan.run_content import (
     read_run,
     write_entries,
 )
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 HIDDEN = ".unfinished"
 
@@ -120,7 +115,7 @@ class RunDirectory:
         needed_bytes: int = 0,
         places: Sequence[ScanPoint] = (),
         beside: Path | None = None,
-    ) -> Self:
+    ) -> RunDirectory:
         """Begin a run.
 
         Parameters
@@ -177,7 +172,7 @@ class RunDirectory:
             )
 
     @classmethod
-    def open(cls, path: Path) -> Self:
+    def open(cls, path: Path) -> RunDirectory:
         """Go on with a run, after whatever ended it.
 
         Removes what was not finished and makes ``metadata.yaml`` and ``results.csv`` anew from the
@@ -211,7 +206,7 @@ class RunDirectory:
             _mend_index(path)
             return cls(path, lock, content)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> RunDirectory:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -285,10 +280,8 @@ class RunDirectory:
         self._listed = len(self._files)
 
 
-class PointRecording:
+class PointRecording(PointFileWriter):
     """Receives the messages of one attempt at a point, or of a reference.
-
-    A context that abandons what was not finished.
 
     Attributes
     ----------
@@ -302,35 +295,15 @@ class PointRecording:
     def __init__(
         self, run: RunDirectory, stem: str, index: int | None = None, attempt: int = 0
     ) -> None:
+        super().__init__(run.path / HIDDEN, run.path / RECORDING / f"{stem}.mcap")
         self._run, self.index, self.attempt = run, index, attempt
         self.measurement_id = 0
-        self._poles: bytes | memoryview = b""
-        self._writer = PointFileWriter(run.path / HIDDEN, run.path / RECORDING / f"{stem}.mcap")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._writer.abandon()
-
-    def write(
-        self,
-        topic: str,
-        type_name: str,
-        time_ns: int,
-        cdr: bytes | memoryview,
-        qos: Qos | None = None,
-    ) -> None:
-        """Append one message; see `PointFileWriter.write`."""
-        self._writer.write(topic, type_name, time_ns, cdr, qos)
-        if type_name == POLES_TYPE and is_poles(topic):
-            self._poles = cdr
 
     def message_of(self, result: PointResult) -> bytes:
         """The result as it is published (CDR), with the last poles recorded."""
-        types = message_types()
-        poles = types.deserialize_cdr(self._poles, POLES_TYPE) if self._poles else None
-        return serialised(result, poles)
+        last = (cdr for topic, cdr in self.newest.items() if is_poles(topic))
+        poles = [message_types().deserialize_cdr(cdr, POLES_TYPE) for cdr in last]
+        return serialised(result, poles[0] if poles else None)
 
     def finish(self, result: PointResult) -> bytes:
         """Keep all with the result of this point and attempt, durably: no interruption loses it from now on.
@@ -341,14 +314,14 @@ class PointRecording:
             `message_of` the result.
         """
         cdr, qos = self.message_of(result), offered_qos(RESULTS_DEPTH, latched=True)
-        self._writer.write(f"/{TOPIC}", TYPE, result.time_ns, cdr, qos)
+        self.write(f"/{TOPIC}", TYPE, result.time_ns, cdr, qos)
         of_point, run = None if self.index is None else result, self._run
 
         def enter(path: Path, content: FileContent) -> None:
             entry = entry_of(path, f"{RECORDING}/{content.name}", content, cdr)
             append_entry(run.path, entry)
 
-        run._add(self._writer.finish(enter), of_point)
+        run._add(self.complete(enter), of_point)
         return cdr
 
 
