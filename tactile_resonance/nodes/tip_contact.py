@@ -153,7 +153,7 @@ class TipContact:
             force_n=force_n,
             hold_s=asked.hold_s,
             press_speed_m_s=asked.press_speed_m_s or 0.0,
-            unload_speed_m_s=asked.unload_speed_m_s or 0.0,
+            unload_speed_m_s=asked.draw_back_m_s,
         )
         try:
             return self._sent(self._tests, goal, check)

@@ -213,10 +213,8 @@ class PoleMap:
     def krige(self) -> KrigedSurface | None:
         """Natural frequency over x, y; None where too few points have a covariance."""
         points = self.with_ellipse
-        if len(points) < LEAST_POINTS:
-            return None
         xy = np.array([p.position_m[:2] for p in points])
-        if on_a_line(xy, SAME_PLACE_M):  # nothing is known beside it
+        if len(xy) < LEAST_POINTS or on_a_line(xy, SAME_PLACE_M):  # nothing is known beside it
             return None
         return krige(xy, [p.result.f0_hz for p in points], [p.result.f0_std_hz for p in points])
 

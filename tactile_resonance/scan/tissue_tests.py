@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 TYPE, TOPIC = "tactile_resonance/msg/Indentation", "indentation"
 BESIDE_S = 30.0
 """Of a test beside its hold, at most: way, zero of the force, pressing and drawing back [s]."""
+USUAL_UNLOAD_M_S = 5e-4
 MECHANICS = "mechanics.csv"
 AT_S = (0.5, 1.0, 10.0, 60.0)
 """Times after a step at which moduli are listed [s]."""
@@ -50,7 +51,7 @@ class ProtocolRequest(Checked):
     press_speed_m_s : float or None
         Towards the tissue and into it, at most [m/s]; None: contact_node's.
     unload_speed_m_s : float or None
-        With which the tip is drawn back [m/s]: of an indentation, 5e-4 where None.
+        With which the tip is drawn back [m/s]: of an indentation, `USUAL_UNLOAD_M_S` where None.
     points : tuple of int
         Numbers of the points, 1 the first; empty: all.
     """
@@ -69,12 +70,16 @@ class ProtocolRequest(Checked):
         super().__post_init__()
         alone = self.unload_speed_m_s is None or drawn
         require(alone, "unload_speed_m_s", self.unload_speed_m_s, f"none with {self.kind.value}")
-        if drawn and self.unload_speed_m_s is None:
-            object.__setattr__(self, "unload_speed_m_s", 5e-4)
         good = all(number >= 1 for number in self.points) and len(set(self.points)) == len(
             self.points
         )
         require(good, "points", list(self.points), "numbers of points, from 1, each once")
+
+    @property
+    def draw_back_m_s(self) -> float:
+        """Speed with which the tip is drawn back while it presses [m/s]; 0: it only holds."""
+        usual_m_s = USUAL_UNLOAD_M_S if self.kind is Protocol.INDENTATION else 0.0
+        return self.unload_speed_m_s or usual_m_s
 
     def concerns(self, index: int) -> bool:
         """Whether it is asked for at the point of an index, which counts from 0."""

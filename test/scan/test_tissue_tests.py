@@ -145,6 +145,12 @@ def test_what_cannot_be_asked_for_is_refused(tmp_path, entry, message):
         read_scan_scene(path)
 
 
+def test_only_an_indentation_draws_back_while_it_presses():
+    usual = ProtocolRequest(Protocol.INDENTATION)
+    assert (RELAXATION.draw_back_m_s, CREEP.draw_back_m_s, usual.draw_back_m_s) == (0.0, 0.0, 5e-4)
+    assert replace(usual, unload_speed_m_s=1e-3).draw_back_m_s == 1e-3
+
+
 def test_a_scan_that_does_not_move_the_tip_refuses_tests(tmp_path):
     path = tmp_path / "scene.yaml"
     entry = {"kind": "relaxation", "hold_s": 5.0}
