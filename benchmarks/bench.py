@@ -21,7 +21,7 @@ from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.multisine import Excitation, design_multisine
 from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun, SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_modes
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
 from tactile_resonance.simulation.sensor.response import Lines, ResponseStream, sample_period
 from tactile_resonance.simulation.tissue.indenter import Indenter
@@ -114,7 +114,7 @@ def measure_timing(setup: Setup, repetitions: int) -> dict[str, tuple[float, flo
         return Indenter(setup.library["cortex"], tip_radius_m=2.5e-3, poisson_ratio=0.49)
 
     def on_beam() -> SprungIndenter:
-        return SprungIndenter.on_beam(rigid(), setup.bench.coupled(None).beam)
+        return SprungIndenter.on_beam(rigid(), sensor_modes(setup.bench.sensor))
 
     tasks: dict[str, tuple[Callable, str]] = {
         "bare real FFT of the record": (transform, ""),

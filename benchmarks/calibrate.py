@@ -31,7 +31,7 @@ from benchmarks.skip_decision import INSIDE, TISSUES
 from tactile_resonance.calibration.contact import ContactStatus
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
-from tactile_resonance.simulation.sensor.bimorph import couple
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_model
 from tactile_resonance.simulation.tissue.hertz import hertz_contact
 
 PROCESSES = 2
@@ -125,14 +125,14 @@ def _contradicted(case: tuple[int, str, float]) -> tuple[float, bool]:
     if "fluid" in what:
         mass_kg = contact.radiation_mass_kg + 1e-6 * float(what.split()[0])
         contact = replace(contact, radiation_mass_kg=mass_kg)
-    coupled = couple(at.bench.sensor, contact)
-    beam = coupled.beam
+    coupled = CoupledBimorph(sensor_model(at.bench.sensor), contact)
+    sensor = coupled.sensor
     if "third" in what:
-        natural = beam.natural_rad_s * np.where(np.arange(beam.natural_rad_s.size) == 2, 1.01, 1)
-        coupled = replace(coupled, beam=replace(beam, natural_rad_s=natural))
+        natural = sensor.natural_rad_s * np.where(np.arange(sensor.modes) == 2, 1.01, 1)
+        coupled = replace(coupled, sensor=replace(sensor, natural_rad_s=natural))
     if "coupling" in what:
-        chi = beam.coupling * np.where(np.arange(beam.coupling.size) == 1, 1.02, 1)
-        coupled = replace(coupled, beam=replace(beam, coupling=chi))
+        chi = sensor.coupling_rad_s * np.where(np.arange(sensor.modes) == 1, 1.02, 1)
+        coupled = replace(coupled, sensor=replace(sensor, coupling_rad_s=chi))
     run = BenchRun(at.bench.sensor, coupled, 7000 + of, BenchEffects())
     signal = excitation(duration_s)
     found = at.estimator(contact_record([run.block(signal)], signal), 0.01, 1e-4)

@@ -50,7 +50,7 @@ def tissue_bias(structures: Sequence[ModelStructure]) -> dict[str, list[FloatArr
             blocks = [run.block(excitation) for _ in range(PERIODS)]
             records.append([np.stack([b.actuator.volts().ravel() for b in blocks]),
                             np.stack([b.sensor.volts().ravel() for b in blocks])])  # fmt: skip
-        mode = run.truth().mode_near(250.0)
+        mode = run.coupled.mode_near(250.0)
         truth = np.array([mode.f0_hz, mode.damping_ratio])
         result[name] = []
         for plan in plans:

@@ -160,11 +160,11 @@ class SensorModel:
         gamma, leak, gain, delay = (np.asarray(getattr(self, name))[..., None] for name in SINGLE)
         return gain * np.exp(-s * delay) * (gamma + x) / (1 + x + leak / s)
 
-    def poles(self, contact: ContactStiffness) -> ComplexArray:
-        """(..., N) all poles on a contact [rad/s], conjugates included, in no order.
+    def state_space(self, contact: ContactStiffness) -> tuple[FloatArray, FloatArray]:
+        """(..., N, N) A and (..., N) B on a contact, from actuator voltage, but for gain and delay.
 
-        Eigenvalues of the states ``w_i q_i``, ``q_i'``, ``sqrt(Ct) v`` and, of each relaxation, ``sqrt(K_j)
-        z_j``, whose squares are energies.
+        States, over the root of Ct: ``w_i q_i``, ``q_i'``, ``sqrt(Ct) v`` and, of each relaxation, ``sqrt(K_j)
+        z_j``, whose squares are energies, which keeps the eigenvalue problem well conditioned.
         """
         w, chi, phi = self.natural_rad_s, self.coupling_rad_s, self.tip_deflection
         n, relaxing = self.modes, contact.relaxing_n_per_m
@@ -172,7 +172,7 @@ class SensorModel:
         size = 2 * n + 1 + terms
         batch = np.broadcast_shapes(w.shape[:-1], relaxing.shape[:-1])
         q, dq, v, z = slice(0, n), slice(n, 2 * n), 2 * n, slice(2 * n + 1, size)
-        a = np.zeros((*batch, size, size))
+        a = np.zeros((*batch, size, size + 1))  # B behind it: the mass acts on both
         index = np.arange(n)
         a[..., index, n + index] = w
         a[..., n + index, index] = -w
@@ -180,6 +180,8 @@ class SensorModel:
         a[..., dq, v] = -chi
         a[..., v, dq] = chi
         a[..., v, v] = -self.leak_rad_s
+        a[..., dq, -1] = chi * (1 - np.asarray(self.feedthrough))[..., None]
+        a[..., v, -1] = -self.feedthrough * self.leak_rad_s
         root, rate = np.sqrt(np.maximum(relaxing, 0)), 1 / contact.times_s
         glassy = contact.elastic_n_per_m + relaxing.sum(axis=-1)
         outer = phi[..., :, None] * phi[..., None, :]
@@ -193,7 +195,11 @@ class SensorModel:
         mass = np.asarray(contact.mass_kg)[..., None]
         share = mass * phi / (1 + mass * (phi**2).sum(axis=-1, keepdims=True))
         a[..., dq, :] -= share[..., :, None] * (phi[..., None, :] @ a[..., dq, :])
-        return np.linalg.eigvals(a).astype(complex)
+        return a[..., :-1], a[..., -1]
+
+    def poles(self, contact: ContactStiffness) -> ComplexArray:
+        """(..., N) all poles on a contact [rad/s], conjugates included, in no order."""
+        return np.linalg.eigvals(self.state_space(contact)[0]).astype(complex)
 
     def residues(self, poles: ComplexArray, contact: ContactStiffness) -> ComplexArray:
         """(..., N) residues of ``G / (gain exp(-s delay))`` at poles (..., N) [rad/s]."""

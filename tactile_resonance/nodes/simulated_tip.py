@@ -410,7 +410,7 @@ def truth_to_response(
 ) -> None:
     """Fill the answer of `bench/get_truth`, with the response at frequencies (F,) [Hz]."""
     response.success = True
-    response.feedthrough = truth.feedthrough
+    response.feedthrough = float(truth.sensor.feedthrough)
     fill_complex(response, "pole_", truth.poles_rad_s, "_rad_s")
     fill_complex(response, "residue_", truth.residues_rad_s, "_rad_s")
     fill(response.f0_hz, [mode.f0_hz for mode in truth.modes])

@@ -4,7 +4,7 @@
 from benchmarks.calibrate_benches import BAND_HZ, RATE_HZ, excitation
 from tactile_resonance.calibration.estimator import ContactRecord
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
-from tactile_resonance.simulation.sensor.bimorph import couple
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_model
 from tactile_resonance.simulation.tissue.hertz import hertz_contact
 
 SKEW_S = 3e-6
@@ -16,7 +16,7 @@ def contact_of(bench, tissue, **options):
 
 def run_on(bench, contact, seed, skew_s=SKEW_S, **effects):
     effects = BenchEffects(channel_skew_s=skew_s, **effects)
-    return BenchRun(bench.sensor, couple(bench.sensor, contact), seed, effects)
+    return BenchRun(bench.sensor, CoupledBimorph(sensor_model(bench.sensor), contact), seed, effects)
 
 
 def played(bench, contact, duration_s=0.02, *, seed, periods=1, skew_s=0.0, settled=0, **effects):

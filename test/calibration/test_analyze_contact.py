@@ -18,7 +18,7 @@ from tactile_resonance.cli import main
 from tactile_resonance.commands.analyze import _pressed
 from tactile_resonance.scan.point_result import PointResult
 from tactile_resonance.scan.run_content import RunContent
-from tactile_resonance.simulation.sensor.bimorph import couple
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_model
 
 FORCE_N = 0.01
 
@@ -99,7 +99,7 @@ def test_a_contradicted_calibration_falls_back_and_says_so(bench, library, senso
     assert found.poles is found.black_box.poles
     assert any("contradict the calibration" in text for text in found.warnings)
     assert any("without the calibration" in text for text in found.warnings)
-    true = couple(bench.sensor, wet).mode_near(250.0)
+    true = CoupledBimorph(sensor_model(bench.sensor), wet).mode_near(250.0)
     assert abs(found.poles.main.f0_hz - true.f0_hz) < 0.2
 
 

@@ -16,7 +16,7 @@ from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import PoleBand
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.sensor.bimorph import couple
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_model
 from tactile_resonance.simulation.sensor.experiments import another_sensor, true_sensor
 
 BANDS = (PoleBand(*BAND_HZ, 2, 6),)
@@ -39,7 +39,7 @@ def test_blocks_of_20_ms_from_rest_give_a_pole(estimated, bench, library, blocks
     )
     assert poles.status is PolesStatus.OK
     assert "calibrated sensor" in poles.method
-    mode = couple(bench.sensor, contact).mode_near(250.0)
+    mode = CoupledBimorph(sensor_model(bench.sensor), contact).mode_near(250.0)
     off = (poles.main.estimate - [mode.f0_hz, mode.damping_ratio]) / poles.main.std
     assert np.abs(off).max() < 4
     assert poles.main.std[0] < 0.2
@@ -51,7 +51,7 @@ def test_what_contradicts_the_sensor_is_fitted_without_it(estimated, bench, libr
     poles = calibrated_poles(frf_of(bench, wet, excitation(0.1), 3), BANDS, estimated, 0.01)
     assert "calibrated" not in poles.method
     assert "without the calibrated sensor: residuals contradict" in poles.message
-    assert abs(poles.main.f0_hz - couple(bench.sensor, wet).mode_near(250.0).f0_hz) < 0.2
+    assert abs(poles.main.f0_hz - CoupledBimorph(sensor_model(bench.sensor), wet).mode_near(250.0).f0_hz) < 0.2
 
 
 def test_lines_outside_of_the_band_are_named(estimated, bench, library):
@@ -84,4 +84,4 @@ def test_another_sensor_in_air_is_fitted_without_the_calibration(library):
     assert poles.main.found
     assert "without the calibrated sensor: " in poles.message
     assert "contradict the calibration" in poles.message
-    assert abs(poles.main.f0_hz - couple(bench.sensor, None).mode_near(250.0).f0_hz) < 0.1
+    assert abs(poles.main.f0_hz - CoupledBimorph(sensor_model(bench.sensor), None).mode_near(250.0).f0_hz) < 0.1

@@ -140,7 +140,7 @@ def test_a_sensor_that_is_not_linear_plays_on_the_contact_whose_truth_is_told(no
     want = run.block(design_multisine(periods=1, level_v=0.5)).sensor.volts()
     np.testing.assert_allclose(record_from_message(blocks[0]).sensor.volts(), want, rtol=0, atol=1e-9)
     assert truths[-1].measurement_id == 3
-    np.testing.assert_allclose(truths[-1].f0_hz, [mode.f0_hz for mode in run.truth().modes])
+    np.testing.assert_allclose(truths[-1].f0_hz, [mode.f0_hz for mode in run.coupled.modes])
 
 
 def test_tissue_that_an_order_placed_is_what_the_sensor_is_on(node, monkeypatch):

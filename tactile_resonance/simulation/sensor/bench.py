@@ -23,8 +23,8 @@ from tactile_resonance.sensor import SensorParameters, read_sensor
 from tactile_resonance.simulation.sensor.bimorph import (
     CoupledBimorph,
     VaryingStream,
-    couple,
     parts_of,
+    sensor_model,
 )
 from tactile_resonance.simulation.sensor.response import Lines, PoleResidueModel, ResponseStream
 from tactile_resonance.simulation.tissue.hertz import (
@@ -114,6 +114,12 @@ class BenchRun:
         beyond the block that is made. The nonlinearity is not modelled on such a contact.
     seed, effects
         As in `SimulatedBench.start`.
+
+    Attributes
+    ----------
+    coupled : CoupledBimorph
+        The exact linear sensor, at the start. At drives of 1 V rms and below estimates are to be compared with
+        it; above, the best linear approximation of the nonlinear sensor differs.
     """
 
     def __init__(
@@ -159,14 +165,6 @@ class BenchRun:
     def negligible_v(self) -> float:
         """What a converter would not resolve [V]: no free decay is computed below it; 0: all are."""
         return NEGLIGIBLE_COUNTS * self._acquisition.sensor_scale_v * self.effects.quantisation
-
-    def truth(self, time_s: float = 0.0) -> CoupledBimorph:
-        """Return the exact linear sensor; on the contact at `time_s` since the start, where it changes.
-
-        At drives of 1 V rms and below estimates are to be compared with it; above, the best linear
-        approximation of the nonlinear sensor differs.
-        """
-        return self.coupled if self._coupled_at is None else self._coupled_at(time_s)
 
     def block(self, excitation: Excitation | Lines, periods: int = 1) -> Record:
         """Return the next periods of an excitation as one block; its origin's time counts from the start."""
@@ -262,7 +260,7 @@ class SimulatedBench:
     ) -> CoupledBimorph:
         """Return the linear sensor in air (`tissue` None) or on tissue."""
         if tissue is None:
-            return couple(self.sensor, None)
+            return CoupledBimorph(sensor_model(self.sensor), None)
         contact = hertz_contact(
             tissue,
             self.sensor.tip.radius_m,
@@ -270,7 +268,7 @@ class SimulatedBench:
             force_n=force_n,
             hold_time_s=hold_time_s,
         )
-        return couple(self.sensor, contact)
+        return CoupledBimorph(sensor_model(self.sensor), contact)
 
     def start(
         self,
@@ -334,7 +332,7 @@ class BenchTip:
             force_n=self.force_n,
             indentation_m=self.depth_m,
         )
-        return couple(bench.sensor, contact)
+        return CoupledBimorph(sensor_model(bench.sensor), contact)
 
 
 LEAST_RADIUS_M = 1e-6
@@ -380,17 +378,10 @@ class ContactSoFar:
     def held(self, length_s: float) -> list[ContactState]:
         """Return what follows for so long if the force of the start is held: creep as in `hertz_contact`."""
         tip, parts = self._tip, parts_of(length_s)
-        assert tip.tissue is not None
-        begin_s = tip.since_s + (self._ends_s[-1] if self._ends_s else 0.0)
-        states = []
+        begin_s, states = tip.since_s + (self._ends_s[-1] if self._ends_s else 0.0), []
         for since_s in (begin_s + (np.arange(parts) + 0.5) * length_s / parts).tolist():
-            contact = hertz_contact(
-                tip.tissue,
-                self._bench.sensor.tip.radius_m,
-                self._bench.contact,
-                force_n=tip.force_n,
-                hold_time_s=since_s,
-            )
+            contact = replace(tip, since_s=since_s).coupled(self._bench).contact
+            assert contact is not None
             states.append((contact.force_n, contact.contact_radius_m, contact.indentation_m))
         return states
 

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_resonance._typing import ComplexArray, FloatArray
+from tactile_resonance.calibration.model import AIR, SensorModel
 from tactile_resonance.cantilever import cantilever_eigenvalues, tip_shape
 from tactile_resonance.fields import require
 from tactile_resonance.sensor import BeamParameters, SensorParameters
@@ -146,65 +147,43 @@ class Mode:
         return -self.pole_rad_s.real / abs(self.pole_rad_s)
 
 
+@lru_cache(maxsize=8)
+def sensor_model(sensor: SensorParameters) -> SensorModel:
+    """Return a sensor in the parameters that its calibration finds, of channels without gain and delay."""
+    beam, electric = sensor_modes(sensor), sensor.electric
+    return SensorModel(
+        beam.natural_rad_s,
+        np.full(beam.natural_rad_s.size, beam.damping_ratio),
+        np.abs(beam.coupling) / np.sqrt(beam.capacitance_f),
+        beam.tip_deflection * np.sign(beam.coupling),
+        np.array(electric.feedthrough),
+        np.array(1 / (electric.input_resistance_ohm * beam.capacitance_f)),
+        np.array(1.0),
+        np.array(0.0),
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class CoupledBimorph:
     """The linear sensor, in air (`contact` None) or on tissue. G = Us / Ua.
 
     Attributes
     ----------
-    beam : BeamModes
-    input_resistance_ohm : float
-    feedthrough : float
-        gamma, the limit of G at infinite frequency.
+    sensor : SensorModel
+        Its feedthrough is gamma, the limit of G at infinite frequency.
     contact : HertzContact or None
     """
 
-    beam: BeamModes
-    input_resistance_ohm: float
-    feedthrough: float
+    sensor: SensorModel
     contact: HertzContact | None
 
     @cached_property
     def state_space(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """(A (N, N), B (N,), C (N,), D) from actuator voltage to sensor voltage.
-
-        States ``w_i q_i``, ``q_i'``, ``sqrt(Ct) v``, ``sqrt(k_j) z_j``: their squares are energies,
-        which keeps the eigenvalue problem well conditioned.
-        """
-        beam, contact = self.beam, self.contact
-        natural, phi, chi = beam.natural_rad_s, beam.tip_deflection, beam.coupling  # (n,) each
-        n = natural.size
-        stiffness = np.zeros(0) if contact is None else contact.prony_stiffness_n_per_m  # (j,)
-        size = 2 * n + 1 + stiffness.size
-        q, dq, v, z = slice(0, n), slice(n, 2 * n), 2 * n, slice(2 * n + 1, size)
-        root_c = np.sqrt(beam.capacitance_f)
-        leak = 1 / (self.input_resistance_ohm * beam.capacitance_f)
-
-        a, b, c = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-        a[q, dq] = np.diag(natural)
-        a[dq, q] = -np.diag(natural)
-        a[dq, dq] = -np.diag(2 * beam.damping_ratio * natural)
-        a[dq, v] = -chi / root_c
-        b[dq] = chi * (1 - self.feedthrough)
-        a[v, dq] = chi / root_c
-        a[v, v] = -leak
-        b[v] = -self.feedthrough * leak * root_c
-        c[v] = 1 / root_c
-        if contact is not None:
-            root_k = np.sqrt(stiffness)
-            rate = 1 / np.asarray(contact.tissue.prony_times_s)  # (j,)
-            glassy = contact.equilibrium_stiffness_n_per_m + stiffness.sum()
-            a[dq, q] -= glassy * np.outer(phi, phi / natural)
-            a[dq, z] = np.outer(phi, root_k)
-            a[dq, dq] -= contact.radiation_damping_ns_per_m * np.outer(phi, phi)
-            a[z, q] = np.outer(rate * root_k, phi / natural)
-            a[z, z] = -np.diag(rate)
-            # radiation mass: M = I + m phi phi^T, inverted by Sherman-Morrison
-            mass = contact.radiation_mass_kg
-            share = mass / (1 + mass * (phi @ phi))
-            a[dq] -= share * np.outer(phi, phi @ a[dq])
-            b[dq] -= share * phi * (phi @ b[dq])
-        return a, b, c, self.feedthrough
+        """(A (N, N), B (N,), C (N,), D) from actuator to sensor voltage; states: `SensorModel.state_space`."""
+        a, b = self.sensor.state_space(AIR if self.contact is None else self.contact.stiffness)
+        c = np.zeros(b.size)
+        c[2 * self.sensor.modes] = 1.0
+        return a, b, c, float(self.sensor.feedthrough)
 
     @cached_property
     def _expansion(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
@@ -233,7 +212,7 @@ class CoupledBimorph:
         keep = self.poles_rad_s.imag >= 0
         x = (self._expansion[2][:, keep] @ (self.modal.weights * modal_state)).real
         if self.contact is not None and after.contact is not None:
-            old, new = (c.prony_stiffness_n_per_m for c in (self.contact, after.contact))
+            old, new = (c.stiffness.relaxing_n_per_m for c in (self.contact, after.contact))
             # states sqrt(k_j) z_j; a term of no stiffness has none
             scale = np.divide(new, old, out=np.zeros_like(new), where=old > 0)
             x[x.size - old.size :] *= np.sqrt(scale)
@@ -261,7 +240,8 @@ class CoupledBimorph:
     def modal(self) -> PoleResidueModel:
         """The system in poles and residues, poles of the upper half plane and the real axis."""
         keep = self.poles_rad_s.imag >= 0
-        return PoleResidueModel(self.poles_rad_s[keep], self.residues_rad_s[keep], self.feedthrough)
+        direct = float(self.sensor.feedthrough)
+        return PoleResidueModel(self.poles_rad_s[keep], self.residues_rad_s[keep], direct)
 
     def response(self, s_rad_s: ArrayLike) -> ComplexArray:
         """Return G(s) at complex s [rad/s] in closed form, independent of the state space.
@@ -271,15 +251,8 @@ class CoupledBimorph:
         s = np.asarray(s_rad_s, dtype=complex)
         at_rest = s == 0
         s = np.where(at_rest, 1.0, s)
-        beam = self.beam
-        natural, phi, chi = beam.natural_rad_s, beam.tip_deflection, beam.coupling
-        ss = s[..., None]
-        modal = 1 / (ss**2 + 2 * beam.damping_ratio * natural * ss + natural**2)  # (..., n)
-        charge, cross, receptance = modal @ chi**2, modal @ (chi * phi), modal @ phi**2
-        k = np.zeros_like(s) if self.contact is None else self.contact.dynamic_stiffness(s)
-        strain = (charge - cross**2 * k / (1 + k * receptance)) / beam.capacitance_f
-        leak = 1 / (s * self.input_resistance_ohm * beam.capacitance_f)
-        return np.where(at_rest, 0.0, (strain + self.feedthrough) / (1 + strain + leak))
+        k = 0.0 if self.contact is None else self.contact.dynamic_stiffness(s)
+        return np.where(at_rest, 0.0, self.sensor.response(s, k).reshape(s.shape))
 
     def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Return G(j 2 pi f), of the shape of `frequency_hz`, in closed form."""
@@ -297,14 +270,6 @@ class CoupledBimorph:
         """Return the resonance whose natural frequency is nearest to `frequency_hz`."""
         require(bool(frequency_hz > 0), "frequency_hz", frequency_hz, "a number above 0")
         return min(self.modes, key=lambda mode: abs(mode.f0_hz - frequency_hz))
-
-
-def couple(sensor: SensorParameters, contact: HertzContact | None) -> CoupledBimorph:
-    """Return the linear sensor in air (`contact` None) or on tissue."""
-    electric = sensor.electric
-    return CoupledBimorph(
-        sensor_modes(sensor), electric.input_resistance_ohm, electric.feedthrough, contact
-    )
 
 
 def pole_trajectory(sensors: Iterable[CoupledBimorph]) -> ComplexArray:

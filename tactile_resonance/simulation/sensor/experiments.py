@@ -28,7 +28,7 @@ from tactile_resonance.simulation.sensor.bench import (
     BenchRun,
     SimulatedBench,
 )
-from tactile_resonance.simulation.sensor.bimorph import couple
+from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_model
 from tactile_resonance.simulation.sensor.response import PoleResidueModel
 from tactile_resonance.simulation.tissue.hertz import HertzContact, Tissue
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -166,19 +166,7 @@ def another_sensor(sensor: SensorParameters, seed: int) -> SensorParameters:
 
 def true_sensor(bench: SimulatedBench, delay_s: float = 0.0) -> SensorModel:
     """Return the parameters that a calibration of a bench should find, its channels so far apart."""
-    air = bench.coupled(None)
-    beam = air.beam
-    sign = np.sign(beam.coupling)
-    return SensorModel(
-        beam.natural_rad_s,
-        np.full(beam.natural_rad_s.size, beam.damping_ratio),
-        np.abs(beam.coupling) / np.sqrt(beam.capacitance_f),
-        beam.tip_deflection * sign,
-        np.array(air.feedthrough),
-        np.array(1 / (air.input_resistance_ohm * beam.capacitance_f)),
-        np.array(1.0),
-        np.array(delay_s),
-    )
+    return replace(sensor_model(bench.sensor), delay_s=np.array(delay_s))
 
 
 def records_of_calibration(
@@ -220,7 +208,7 @@ def records_of_calibration(
     made, loads = [], [*loads, ("loopback", 0.0)]
     noise_seeds = np.random.SeedSequence([seed, 12]).generate_state(len(loads), np.uint64).tolist()
     for noise_seed, (kind, value) in zip(noise_seeds, loads, strict=True):
-        coupled = couple(bench.sensor, _known_load(kind, value) if value else None)
+        coupled = CoupledBimorph(sensor_model(bench.sensor), _known_load(kind, value) if value else None)
         if kind == "loopback":
             nothing = np.zeros(0, complex)
             wire = PoleResidueModel(nothing, nothing, 1.0)  # both channels on the generator

@@ -14,7 +14,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tactile_resonance._typing import ComplexArray, FloatArray
+from tactile_resonance._typing import ComplexArray
+from tactile_resonance.calibration.model import ContactStiffness
 from tactile_resonance.fields import AboveZero, Checked, Range, require
 from tactile_resonance.mechanics.prony import Prony
 
@@ -100,14 +101,13 @@ class HertzContact:
     radiation_mass_kg: float
 
     @property
-    def equilibrium_stiffness_n_per_m(self) -> float:
-        """Stiffness at zero frequency [N/m]."""
-        return self.stiffness_factor_m * self.tissue.prony.equilibrium_pa
-
-    @property
-    def prony_stiffness_n_per_m(self) -> FloatArray:
-        """Stiffness of each Prony term [N/m], shape (terms,)."""
-        return self.stiffness_factor_m * self.tissue.prony.moduli_pa
+    def stiffness(self) -> ContactStiffness:
+        """``k*``, term by term."""
+        prony, per_pa = self.tissue.prony, self.stiffness_factor_m
+        radiated = self.radiation_damping_ns_per_m, self.radiation_mass_kg
+        return ContactStiffness(
+            per_pa * prony.equilibrium_pa, per_pa * prony.moduli_pa, prony.times_s, *radiated
+        )
 
     def dynamic_stiffness(self, s_rad_s: ArrayLike) -> ComplexArray:
         """Return ``k*(s)`` [N/m] at complex s [rad/s], of the shape of `s_rad_s`."""

@@ -75,7 +75,7 @@ def test_ideal_bench_is_the_linear_sensor(bench, gel, multisine):
     *_, last = run.play(excitation, 30)
     lines = Lines.of(excitation)
     np.testing.assert_allclose(last.actuator.volts(), sample_period(lines), atol=1e-12)
-    truth = run.truth().frequency_response(lines.frequency_hz)
+    truth = run.coupled.frequency_response(lines.frequency_hz)
     found = response_at(lines, last)
     # what is left after 3 s is the slow relaxation, and the drain of the sensing layer
     np.testing.assert_allclose(found, truth, atol=2e-6)
@@ -85,16 +85,16 @@ def test_ideal_bench_is_the_linear_sensor(bench, gel, multisine):
 
 def test_truth_is_consistent(bench, gel):
     frequency = np.array([50.0, 250.0, 4000.0])
-    truth = bench.start(gel, force_n=0.02).truth()
+    truth = bench.start(gel, force_n=0.02).coupled
     s = 2j * np.pi * frequency[:, None]
-    summed = truth.feedthrough + (truth.residues_rad_s / (s - truth.poles_rad_s)).sum(axis=1)
+    summed = truth.sensor.feedthrough + (truth.residues_rad_s / (s - truth.poles_rad_s)).sum(axis=1)
     np.testing.assert_allclose(summed, truth.frequency_response(frequency), rtol=1e-9)
     contact = truth.contact
     assert contact.force_n == 0.02
     assert contact.indentation_m == pytest.approx(contact.contact_radius_m**2 / 2.5e-3)
     assert truth.mode_near(250).pole_rad_s in truth.poles_rad_s
     assert contact.tissue is gel
-    assert bench.start(None).truth().contact is None
+    assert bench.start(None).coupled.contact is None
 
 
 PLAIN = BenchEffects(quantisation=False)
@@ -183,7 +183,7 @@ def test_channel_skew_is_a_linear_phase(bench, gel, multisine):
     for skew in (3.7e-6, -3.7e-6, 1.0e-3):
         run = bench.start(gel, effects=replace(IDEAL, channel_skew_s=skew))
         *_, last = run.play(lines, 30)
-        truth = run.truth().frequency_response(lines.frequency_hz)
+        truth = run.coupled.frequency_response(lines.frequency_hz)
         expected = truth * np.exp(-2j * np.pi * lines.frequency_hz * skew)
         np.testing.assert_allclose(response_at(lines, last), expected, atol=2e-6)
 

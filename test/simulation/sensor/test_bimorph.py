@@ -9,8 +9,10 @@ import pytest
 from scipy import optimize
 
 from tactile_resonance.cantilever import cantilever_eigenvalues, frequency_equation, mode_shape
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.sensor.bimorph import mass_per_length, sensor_modes
 
+BEAM, INPUT_OHM = sensor_modes(read_sensor()), 1e7  # of the physics reference
 # f0 Hz, damping ratio, Re and Im of the pole rad/s, peak dB over 200-300 Hz: computed figures of
 # the project's physics reference, one unit in the last digit each
 UNITS = np.array([0.01, 1e-4, 0.1, 0.1, 0.1])
@@ -92,7 +94,7 @@ def characteristic(coupled, s):
     beam by the tissue, another by the electric load - times the denominators of the uncoupled
     parts, so that it is zero exactly at the poles and finite everywhere.
     """
-    beam, s = coupled.beam, np.asarray(s, dtype=complex)
+    beam, s = BEAM, np.asarray(s, dtype=complex)
     relative = s[..., None] / beam.natural_rad_s
     uncoupled = relative**2 + 2 * beam.damping_ratio * relative + 1  # (..., n)
     modal = 1 / (uncoupled * beam.natural_rad_s**2)
@@ -100,7 +102,7 @@ def characteristic(coupled, s):
     k = 0.0 if coupled.contact is None else coupled.contact.dynamic_stiffness(s)
     touched = 1 + k * (modal @ phi**2)
     alpha = modal @ chi**2 - (modal @ (chi * phi)) ** 2 * k / touched
-    loaded = 1 + (alpha + 1 / (s * coupled.input_resistance_ohm)) / beam.capacitance_f
+    loaded = 1 + (alpha + 1 / (s * INPUT_OHM)) / beam.capacitance_f
     value = loaded * touched * s * np.prod(uncoupled, axis=-1)
     if coupled.contact is not None:
         times = np.asarray(coupled.contact.tissue.prony_times_s)

@@ -68,7 +68,7 @@ def test_from_rest_it_satisfies_the_differential_equation(bench, library, sensor
         slope, (0, 0.02), np.zeros(poles.size, dtype=complex), method="DOP853",
         rtol=1e-10, atol=1e-13, t_eval=times,
     )  # fmt: skip
-    expected = weights @ solution.y.real + coupled.feedthrough * np.array([u(t) for t in times])
+    expected = weights @ solution.y.real + coupled.sensor.feedthrough * np.array([u(t) for t in times])
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(distortion).max())
 
 
