@@ -57,9 +57,9 @@ class CanWrench:
 
     def __init__(self, config: CanForce, clock: Clock | None = None) -> None:
         self.mounting: Mounting = config
-        self._config, self.info = config, config.info
+        self._config = self.info = config
         self.clock: Clock = WallClock() if clock is None else clock
-        self._checks = CellChecks(config.info, config.range_nm, config.limits)
+        self._checks = CellChecks(config, config.range_nm, config.limits)
         self._bus: Bus | None = None
         self._fault: ForceError | None = None
         self._stamped, self._latency_ns = config.stamps == "adapter", round(config.latency_s * 1e9)
@@ -110,7 +110,7 @@ class CanWrench:
     def _open(self) -> None:
         self._checks.restart()
         self._begin()
-        info, description = self._config.info, self._config.description
+        info, description = self._config, self._config.description
         request, commands = None, description.commands
         if commands.request is not None:
             request = (commands.id, commands.request, description.extended_ids, 1 / info.rate_hz)
@@ -175,7 +175,7 @@ class CanWrench:
     def _where(self) -> str:
         bus = self._config.bus
         address = ":".join(str(bus[key]) for key in ("host", "port", "channel") if key in bus)
-        return f"{self._config.info.name} on {bus['interface']} {address}"
+        return f"{self._config.name} on {bus['interface']} {address}"
 
     def _begin(self) -> None:
         """Nothing has come yet."""
@@ -188,7 +188,7 @@ class CanWrench:
 
     def _new_assembler(self) -> Assembler:
         # times of arrival scatter by more than a period: there only the order pairs frames
-        within_s = 0.5 / self._config.info.rate_hz if self._stamped else math.inf
+        within_s = 0.5 / self._config.rate_hz if self._stamped else math.inf
         return Assembler(self._ids, within_s)
 
     def _send(self, bus: Bus, data: bytes) -> None:
@@ -210,7 +210,7 @@ class CanWrench:
                         raise ForceError(ForceFault.REFUSED, f"{self._where}: does not stop")
         setup = list(commands.setup)
         if commands.rates:
-            rate_hz = int(self._config.info.rate_hz)
+            rate_hz = int(self._config.rate_hz)
             setup.append(CellCommand(commands.rates[rate_hz], f"rate {rate_hz} Hz"))
         for command in setup:
             self._send(bus, command.data)
@@ -279,7 +279,7 @@ class CanWrench:
         streams = self._config.description.commands.request is None
         short_hz = self._flow.short(now_s, self.received + self.lost) if streams else None
         if short_hz is not None:
-            text = f"{short_hz:.0f} wrenches/s of {self._config.info.rate_hz:.0f} arrive"
+            text = f"{short_hz:.0f} wrenches/s of {self._config.rate_hz:.0f} arrive"
             why = "the interface is too slow, or rate_hz is not the cell's"
             raise ForceError(ForceFault.INCOMPLETE, f"{self._where}: {text}: {why}")
         return samples

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -63,8 +62,8 @@ def _read_bus(value: object, where: str) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForceConfig(Mounting):
-    """A force source: what its file in ``config/force`` states, whatever its kind, and where it sits.
+class ForceConfig(Mounting, ForceInfo):
+    """A force source: what it can do, as its file in ``config/force`` states, and where it sits.
 
     Attributes
     ----------
@@ -76,47 +75,30 @@ class ForceConfig(Mounting):
     range_n, range_nm : float
         Largest force and torque of each axis [N], [N m].
     name : str
+        In files its kind, where it is left out.
     latency_s : float
         From the force to the time stamp, filters of the sensor included [s].
     limits : CellLimits
-    resolution_n : float or None
-        Smallest step [N]; None: a count of a cell on CAN.
+    resolution_n : float
+        Smallest step [N]; in files that of a cell on CAN may be left out, where it is a count.
     """
 
     kind: str
+    name: str
     rate_hz: AboveZero
     noise_rms_n: AboveZero
+    resolution_n: AboveZero
     range_n: AboveZero
     range_nm: AboveZero
-    name: str = ""
     latency_s: Delay = 0.0
     limits: CellLimits = field(default_factory=CellLimits)
-    resolution_n: AboveZero | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         Checked.__post_init__(self)
-        good = self._step_n is not None
-        require(good, "resolution_n", None, "a number above 0: not known of this source")
         silent_s = self.limits.silent_s
         good = silent_s * self.rate_hz >= 2
         require(good, "limits.silent_s", silent_s, "two periods of rate_hz or more")
-
-    @property
-    def _step_n(self) -> float | None:
-        return self.resolution_n
-
-    @cached_property
-    def info(self) -> ForceInfo:
-        """What the source can do."""
-        assert self._step_n is not None
-        return ForceInfo(
-            name=self.name or self.kind,
-            rate_hz=self.rate_hz,
-            noise_rms_n=self.noise_rms_n,
-            resolution_n=self._step_n,
-            range_n=self.range_n,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,12 +159,6 @@ class CanForce(ForceConfig):
         require(good, "rate_hz", self.rate_hz, f"one of {sorted(rates)}")
 
     @property
-    def _step_n(self) -> float | None:
-        # with a matrix it depends on the direction
-        stated = self.resolution_n is not None or not self.counts_per_n
-        return self.resolution_n if stated else 1 / self.counts_per_n
-
-    @property
     def scale(self) -> np.ndarray:
         """(6, 6) from counts to N and N m."""
         if self.matrix is not None:
@@ -216,14 +192,19 @@ def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:
     known = type(kind) is str and kind in _KINDS
     require(known, f"{where} kind", kind, f"one of {', '.join(_KINDS)}")
     given: dict[str, Any] = {}
+    if not content.get("name", ""):
+        content["name"] = kind
     if kind == "can":
+        counts = content.get("counts_per_n")  # with a matrix the step depends on the direction
+        if content.get("resolution_n") is None and type(counts) in (int, float) and counts > 0:
+            content["resolution_n"] = 1 / counts
         frames = read_file_name(content.get("frames"), f"{where} frames")
         beside = path.parent / frames
         file = beside if beside.is_file() else Path(frames)
         given["description"] = build(read_can_description, where, file)
     config: ForceConfig = read_dataclass(_KINDS[kind], content, where, **given)
     if force_n is not None:
-        require_fit(config.info, force_n)
+        require_fit(config, force_n)
     return config
 
 
@@ -247,9 +228,9 @@ class RtdeWrench:
                 "mount, frame, payload: expected tool, zeros and none, the controller knows them"
             )
         self.mounting: Mounting = config
-        self.info = config.info
+        self.info: ForceInfo = config
         self._config, self._arm, self._clock = config, arm, arm.clock
-        self._checks = CellChecks(config.info, config.range_nm, config.limits)
+        self._checks = CellChecks(config, config.range_nm, config.limits)
         self._robot_time_s = -math.inf
         self._new_s = 0.0
 
@@ -286,9 +267,9 @@ class RtdeWrench:
         try:
             state = self._arm.recent()
         except ArmError as error:
-            raise ForceError(ForceFault.LINK_LOST, f"{self._config.info.name}: {error}") from error
+            raise ForceError(ForceFault.LINK_LOST, f"{self._config.name}: {error}") from error
         if state.tool_wrench is None:
-            text = f"{self._config.info.name}: the arm brings no wrench"
+            text = f"{self._config.name}: the arm brings no wrench"
             raise ForceError(ForceFault.REFUSED, text)
         return state
 

@@ -60,10 +60,10 @@ class TopicWrench:
 
     def __init__(self, node: Node, config: TopicForce, clock: Clock | None = None) -> None:
         self.mounting: Mounting = config
-        self._node, self._config, self.info = node, config, config.info
+        self._node, self._config, self.info = node, config, config
         self._clock: Clock = WallClock() if clock is None else clock
         self.arrivals = Arrivals()
-        self._checks = CellChecks(config.info, config.range_nm, config.limits)
+        self._checks = CellChecks(config, config.range_nm, config.limits)
         self._samples: deque[CellSample] = deque(maxlen=10000)
         self._fault: ForceError | None = None
         self._silent_from_s = 0.0

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 def test_the_simulated_cell_serves_1_cn():
     config = read_force_config(Path("can_simulated.yaml"), force_n=0.01)
-    assert config.info.resolution_n == pytest.approx(2e-4)
+    assert config.resolution_n == pytest.approx(2e-4)
     assert config.mount is Mount.TABLE
     assert config.bus["tcp_tune"] is True
     np.testing.assert_allclose(np.diag(config.scale), [2e-4] * 3 + [1e-5] * 3)
@@ -34,9 +34,9 @@ def test_the_simulated_cell_serves_1_cn():
 def test_driver_and_simulation_agree_on_the_cell(force, cell):
     config = read_force_config(Path(force))
     simulated = CellParameters.from_yaml(share_path(f"config/load_cells/{cell}"))
-    assert config.info.resolution_n == pytest.approx(1 / simulated.force_divisor)
-    assert config.info.noise_rms_n == simulated.force_noise_rms_n
-    assert config.info.range_n == simulated.force_range_n
+    assert config.resolution_n == pytest.approx(1 / simulated.force_divisor)
+    assert config.noise_rms_n == simulated.force_noise_rms_n
+    assert config.range_n == simulated.force_range_n
     assert config.range_nm == simulated.torque_range_nm
 
 

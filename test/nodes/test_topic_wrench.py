@@ -101,7 +101,7 @@ def test_wrenches_arrive_in_order_as_sent_and_dated_when_they_were_measured(link
     assert link.source.read() == []
 
 
-STUCK = samples_until_stuck(CONFIG.info)
+STUCK = samples_until_stuck(CONFIG)
 
 
 @pytest.mark.parametrize(
