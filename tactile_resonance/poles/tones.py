@@ -149,7 +149,7 @@ class _Fitted:
         return np.asarray(self.y - self._output[0])
 
     def without_each(self) -> FloatArray:
-        """(K,) mean over records of what the cost falls by without a bin, in units of its variance.
+        """(K,) what the cost falls by without a bin, in units of its variance, see `_mean_of`.
 
         0 where a bin is not used.
         """
@@ -158,7 +158,20 @@ class _Fitted:
         u = np.where(plan.driven, self.u, 0)
         bases = (plan.denominator_basis.values, plan.numerator_on_bins, plan.transient_on_bins)
         scale, error = weight / self._denominator, self.errors() * weight
-        return np.asarray(falls_without_each(bases, self._output[0], u, scale, error).mean(axis=0))
+        return _mean_of(falls_without_each(bases, self._output[0], u, scale, error), plan)
+
+
+def _mean_of(power: FloatArray, plan: JointPlan) -> FloatArray:
+    """(K,) mean over records of powers (M, K), each in units of its own level and at the mean of these.
+
+    Of records that are not equally noisy the plain mean would be that of the noisiest alone, which exceeds its
+    surroundings more often than a mean of M does.
+    """
+    at = plan.others_at if plan.others_at.size else plan.order
+    level = np.median(power[:, at], axis=1)
+    if not level.all():  # an exact input
+        return np.asarray(power.mean(axis=0))
+    return np.asarray(level.mean() * np.mean(power / level[:, None], axis=0))
 
 
 def has_tones(plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch) -> bool:
@@ -258,7 +271,7 @@ def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
         ROUNDING * np.mean(np.abs(x[:, plan.driven]) ** 2) for x in (fitted.y, fitted.u)
     )
     kinds = _kinds(plan)
-    input_power = np.mean(np.abs(fitted.u) ** 2, axis=0)
+    input_power = _mean_of(np.abs(fitted.u) ** 2, plan)
     falls, least = fitted.without_each(), rounding_y / fitted.variance
     if not plan.level_known:  # noise of the input may make more at a resonance
         least = np.maximum(least, 1.4 * median_filter(falls, 5))
