@@ -323,6 +323,8 @@ def accepted(kind: Any) -> str:
     choices = [item.value for item in kind] if enumeration else get_args(kind)
     if enumeration or get_origin(kind) is Literal:
         return f"{'one of ' if len(choices) > 1 else ''}{', '.join(map(str, choices))}"
+    if dataclasses.is_dataclass(kind):
+        return f"a mapping with {', '.join(_fields(cast(type, kind)))}"
     return _PLAIN.get(kind, "a number" if kind is float else "a value")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -123,6 +124,12 @@ def test_what_is_wrong_is_named(change, message):
     with pytest.raises(ValueError, match=".") as caught:
         read_dataclass(Outer, LEAST | change, "f.yaml:")
     assert message in str(caught.value)
+
+
+def test_what_a_field_that_is_missing_consists_of_is_told():
+    told = "inner: got None; accepted is a mapping with low, high (it is missing)"
+    with pytest.raises(ValueError, match=re.escape(told)):
+        read_dataclass(Outer, {"name": "x"}, "")
 
 
 def test_one_of_several_keys_names_the_kind():
