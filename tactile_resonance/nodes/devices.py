@@ -7,13 +7,15 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.client import Client
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from tactile_resonance import msg
@@ -287,18 +289,24 @@ class MeasuredContact:
         self._client = node.client_of(ForceOver, "force_over")
         self._within_s = node.hung_after_s if node.time_server else FORCE_WITHIN_S
 
-    def over(self, start_ns: int, end_ns: int) -> Contact:
-        """Contact from one ROS time to another [ns]; with a reason where the force is unknown."""
+    def ask(self, start_ns: int, end_ns: int) -> Callable[[], Contact]:
+        """Ask for the contact from one ROS time to another [ns].
+
+        What it gives waits for the answer: a contact, with a reason where the force is unknown.
+        """
         deadline = time.monotonic() + min(self._within_s, DISCOVERED_WITHIN_S)
         # rclpy's own wait looks four times a second
         while not self._client.service_is_ready():
             if time.monotonic() >= deadline:
-                return Contact(reason=f"no node serves {self._client.srv_name}")
+                return partial(Contact, reason=f"no node serves {self._client.srv_name}")
             time.sleep(POLL_S)
         request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))
         answered = threading.Event()
         future = self._client.call_async(request)
         future.add_done_callback(lambda _: answered.set())
+        return partial(self._answer, future, answered)
+
+    def _answer(self, future: Future, answered: threading.Event) -> Contact:
         if not answered.wait(self._within_s):
             self._client.remove_pending_request(future)
             return Contact(
@@ -317,11 +325,11 @@ class PublishedPlace:
         self._pose = PoseStamped()
         node.listen(PoseStamped, "tcp_pose", self._on_pose, STREAM)
 
-    def over(self, start_ns: int, end_ns: int) -> Contact:
-        """The newest place, whatever the interval."""
+    def ask(self, start_ns: int, end_ns: int) -> Callable[[], Contact]:
+        """What gives the newest place, whatever the interval."""
         nan = float("nan")
         contact = contact_from_message(self._pose, nan, nan)
-        return replace(contact, reason="the force is not measured (contact_source)")
+        return partial(replace, contact, reason="the force is not measured (contact_source)")
 
     def _on_pose(self, message: PoseStamped) -> None:
         self._pose = message

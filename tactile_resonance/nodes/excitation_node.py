@@ -6,7 +6,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -21,11 +21,16 @@ from tactile_resonance.fields import counted
 from tactile_resonance.multisine import Excitation, Grid, compress_crest_factor, design_multisine
 from tactile_resonance.nodes import devices
 from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, ManagedNode, in_thread
-from tactile_resonance.nodes.messages import NO_RECORDS, excitation_to_message, record_to_message
+from tactile_resonance.nodes.messages import (
+    NO_RECORDS,
+    excitation_to_message,
+    record_to_message,
+    write_record_origin,
+)
 from tactile_resonance.nodes.parameters import Fixed, Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS
 from tactile_resonance.poles.structure import PoleBand
-from tactile_resonance.record import Origin, Record
+from tactile_resonance.record import Contact, Origin, Record
 from tactile_resonance.recording.messages import GRIDS, each_from_message, key_of
 from tactile_resonance.recording.store import RecordStore
 from tactile_resonance.sensor import MAX_LEVEL_V
@@ -247,8 +252,8 @@ class ExcitationNode(ManagedNode):
     ) -> None:
         (timeout_s,) = values(self, "block_timeout_s")
 
-        def hand_out(record: Record) -> None:
-            self._records.publish(record_to_message(record))
+        def hand_out(message: msg.Record) -> None:
+            self._records.publish(message)
             result.blocks += 1
 
         if store is not None:
@@ -265,11 +270,16 @@ class ExcitationNode(ManagedNode):
                     if self._cancelled.is_set():
                         raise Cancelled from error
                     raise
+                contact = self._contact_over(block, excitation, info)
+                # what is known is made ready while the contact is asked for
                 record = self._record(block, excitation, info)
+                message = record_to_message(record)
+                origin = partial(self._origin, record, contact, message)
                 if store is None:
-                    hand_out(record)
+                    origin()
+                    hand_out(message)
                 else:  # what is written no kill of this node can lose; the disk takes its time
-                    store.add_record(record, partial(hand_out, record))
+                    store.add_record(record, partial(hand_out, message), origin)
                 goal.publish_feedback(
                     Measure.Feedback(blocks=result.blocks, blocks_planned=planned)
                 )
@@ -290,23 +300,35 @@ class ExcitationNode(ManagedNode):
             if device is self._device:
                 self._read_by_s = float("inf")
 
+    def _contact_over(
+        self, block: Record, excitation: Excitation, info: DeviceInfo
+    ) -> Callable[[], Contact]:
+        """What waits for the contact over a block, which is asked for now."""
+        if info.recorded:
+            return lambda: block.origin.contact
+        begin_ns = block.origin.time_ns
+        return self._contact.ask(begin_ns, begin_ns + round(excitation.period_s * 1e9))
+
+    @staticmethod
+    def _origin(record: Record, contact: Callable[[], Contact], message: msg.Record) -> Origin:
+        """The origin of a record with its contact, also in its message."""
+        origin = replace(record.origin, contact=contact())
+        write_record_origin(message, origin)
+        return origin
+
     def _record(self, block: Record, excitation: Excitation, info: DeviceInfo) -> Record:
-        """A block of the device as one of the measurement."""
+        """A block of the device as one of the measurement, its contact apart."""
         last_period = block.block_index == excitation.periods - 1
         last_realisation = excitation.realisation == excitation.realisations - 1
-        begin_ns, contact, frame_id = block.origin.time_ns, block.origin.contact, block.origin.frame_id
-        if not info.recorded:
-            end_ns = begin_ns + round(excitation.period_s * 1e9)
-            contact, frame_id = self._contact.over(begin_ns, end_ns), ""
+        frame_id = block.origin.frame_id if info.recorded else ""
         origin = Origin(
             measurement_id=excitation.measurement_id,
             excitation_id=excitation.excitation_id,
-            time_ns=begin_ns,
+            time_ns=block.origin.time_ns,
             final=last_period and last_realisation,
             frame_id=frame_id or self._frame_id,
             label=excitation.label,
             simulated=block.origin.simulated,
-            contact=contact,
         )
         return replace(block, realisation=excitation.realisation, origin=origin)
 

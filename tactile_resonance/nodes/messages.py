@@ -109,8 +109,13 @@ def record_to_message(record: Record) -> msg.Record:
             write_values(message, ("scale_v", "offset_v"), channel, f"{name}_")
         else:
             fill(getattr(message, f"{name}_v"), channel.samples)
-    _write_origin(message, record.origin)
-    return write_values(message, ("coverage", "reason"), record.origin.contact, "contact_")
+    return write_record_origin(message, record.origin)
+
+
+def write_record_origin(message: msg.Record, origin: Origin) -> msg.Record:
+    """Write what a record belongs to, with the contact over it; return the message."""
+    _write_origin(message, origin)
+    return write_values(message, ("coverage", "reason"), origin.contact, "contact_")
 
 
 def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:

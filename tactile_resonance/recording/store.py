@@ -27,13 +27,14 @@ import numpy.typing as npt
 from tactile_resonance.fields import one_line
 from tactile_resonance.files import PART, sync, write_whole
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.record import SIMULATED, Record
+from tactile_resonance.record import SIMULATED, Origin, Record
 from tactile_resonance.recording.recording import Recording, make_recording
 
 T = TypeVar("T", Excitation, Record)
 Fields = dict[str, npt.NDArray[Any]]
 
 _FORMAT = "tactile_resonance {} 1"
+_ORIGIN = "origin."
 _DTYPE = ":dtype"  # suffix of the field that names the integer type an array had
 _DAMAGE = (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError,
            SyntaxError, MemoryError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
@@ -107,14 +108,20 @@ class RecordStore:
         folder = self._folder_of(excitation.measurement_id)
         write_stored(folder / f"excitation-{excitation.realisation:05d}.npz", excitation)
 
-    def add_record(self, record: Record, written: Callable[[], None] | None = None) -> None:
+    def add_record(
+        self,
+        record: Record,
+        written: Callable[[], None] | None = None,
+        origin: Callable[[], Origin] | None = None,
+    ) -> None:
         """Write one block; OSError where that fails.
 
-        `written` is called once a kill of this process cannot lose it any more, before the disk has it.
+        `written` is called once a kill of this process cannot lose it any more, before the disk has it. An
+        `origin` that is known later than the samples is asked for once all else is packed.
         """
         folder = self._folder_of(record.origin.measurement_id)
         name = f"record-{record.realisation:05d}-{record.block_index:07d}.npz"
-        write_stored(folder / name, record, written)
+        write_stored(folder / name, record, written, origin)
 
     def remove(self, measurement_id: int) -> None:
         """Remove a measurement that this store received and that is safe elsewhere; others stay."""
@@ -391,7 +398,10 @@ def _stated(records: Sequence[Record]) -> Iterator[str]:
 
 
 def write_stored(
-    path: Path, value: Excitation | Record, written: Callable[[], None] | None = None
+    path: Path,
+    value: Excitation | Record,
+    written: Callable[[], None] | None = None,
+    origin: Callable[[], Origin] | None = None,
 ) -> None:
     """Write one object durably: a reader, or a power cut, finds the whole file or none.
 
@@ -404,6 +414,8 @@ def write_stored(
         held in the smallest signed type that holds them exactly.
     written : callable, optional
         See `write_whole`.
+    origin : callable, optional
+        Gives the origin of a record, in place of its own; called once all else is packed.
 
     Raises
     ------
@@ -413,15 +425,25 @@ def write_stored(
         If it cannot be written; nothing is left behind, unless `written` was called.
     """
     content: Fields = {"format": np.array(_FORMAT.format(type(value).__name__))}
+    last: Fields = {}
     _flatten("", value, content)
-    # a damaged zip directory can lose a field without an error
-    content["fields"] = np.array(sorted(content))
+    if origin is not None:
+        content = {name: content[name] for name in content if not name.startswith(_ORIGIN)}
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:  # as numpy.savez, in a third of the time less
-        for name, array in content.items():
-            archive.writestr(f"{name}.npy", _header(array.dtype.str, array.shape) + array.tobytes())
+        _pack(archive, content)
+        if origin is not None:
+            _flatten(_ORIGIN, origin(), last)
+        # a damaged zip directory can lose a field without an error
+        last["fields"] = np.array(sorted([*content, *last]))
+        _pack(archive, last)
     write_whole(path, buffer.getvalue(), written)
     sync(path.parent)
+
+
+def _pack(archive: zipfile.ZipFile, content: Fields) -> None:
+    for name, array in content.items():
+        archive.writestr(f"{name}.npy", _header(array.dtype.str, array.shape) + array.tobytes())
 
 
 def read_stored(path: Path, kind: type[T]) -> T:

@@ -275,7 +275,9 @@ def test_what_the_service_tells_of_exactly_this_block_arrives(monkeypatch):
     with asker() as (node, other):
         other.create_service(ForceOver, "force_over", serve)
         wait(node.source._client.service_is_ready)
-        told = node.source.over(START_NS, END_NS)
+        answer = node.source.ask(START_NS, END_NS)
+        wait(lambda: asked)  # the question is under way before anybody waits for its answer
+        told = answer()
     assert asked == [(START_NS, END_NS)]
     assert told == Contact(
         force_n=0.0101,
@@ -302,7 +304,7 @@ def test_a_service_that_is_discovered_late_is_waited_for(monkeypatch):
     with asker() as (node, other):
         later = threading.Timer(0.5, other.create_service, (ForceOver, "force_over", serve))
         later.start()
-        told = node.source.over(START_NS, END_NS)
+        told = node.source.ask(START_NS, END_NS)()
         later.join()
     assert (told.force_n, told.reason) == (0.01, "")
 
@@ -319,7 +321,7 @@ def test_a_force_that_is_not_known_keeps_its_reason_and_its_place(monkeypatch):
     with asker() as (node, other):
         other.create_service(ForceOver, "force_over", serve)
         wait(node.source._client.service_is_ready)
-        told = node.source.over(START_NS, END_NS)
+        told = node.source.ask(START_NS, END_NS)()
     assert math.isnan(told.force_n)
     assert (told.coverage, told.reason) == (0.4, "forces cover 40 % of the block")
     assert told.position_m == (0.1, 0.0, 0.3)
@@ -327,7 +329,7 @@ def test_a_force_that_is_not_known_keeps_its_reason_and_its_place(monkeypatch):
 
 def test_without_a_service_the_reason_says_so():
     with asker() as (node, _):
-        told = node.source.over(START_NS, END_NS)
+        told = node.source.ask(START_NS, END_NS)()
     assert math.isnan(told.force_n)
     assert told.position_m is None
     assert told.reason == "no node serves force_over"
@@ -353,7 +355,7 @@ def test_a_record_does_not_wait_for_an_answer_that_does_not_come(monkeypatch, pa
         other.create_service(ForceOver, "force_over", serve)
         wait(node.source._client.service_is_ready)
         monkeypatch.setattr(devices, "threading", SimpleNamespace(Event=NeverSet))
-        contact = node.source.over(START_NS, END_NS)
+        contact = node.source.ask(START_NS, END_NS)()
         assert waited_s == [within_s]
         assert not node.source._client._pending_requests
     assert math.isnan(contact.force_n)
@@ -362,13 +364,13 @@ def test_a_record_does_not_wait_for_an_answer_that_does_not_come(monkeypatch, pa
 
 def test_where_nobody_measures_the_force_the_place_is_what_is_told():
     with asker(contact_source="tcp_pose") as (node, other):
-        nowhere = node.source.over(START_NS, END_NS)
+        nowhere = node.source.ask(START_NS, END_NS)()
         assert nowhere.position_m is None
         poses = other.create_publisher(PoseStamped, "tcp_pose", PLACES)
         wait(lambda: poses.get_subscription_count() == 1)
         poses.publish(pose_at(START_NS))
-        wait(lambda: node.source.over(START_NS, END_NS).position_m is not None)
-        told = node.source.over(START_NS, END_NS)
+        wait(lambda: node.source.ask(START_NS, END_NS)().position_m is not None)
+        told = node.source.ask(START_NS, END_NS)()
     for contact in (nowhere, told):
         assert math.isnan(contact.force_n)
         assert contact.reason == "the force is not measured (contact_source)"

@@ -81,6 +81,15 @@ def test_large_ids_come_back(tmp_path):
     assert_same(read_stored(tmp_path / "r.npz", Record), record)
 
 
+def test_an_origin_that_is_known_after_the_samples_is_that_of_the_file(tmp_path):
+    record = stores.record(stores.excitations()[0], 0)
+    contact = Contact(0.0101, 2e-5, (0.1, 0.0, 0.3), frame_id="base", coverage=0.9)
+    whole = replace(record, origin=replace(record.origin, contact=contact))
+    before = replace(record, origin=replace(record.origin, contact=Contact(reason="not asked yet")))
+    write_stored(tmp_path / "r.npz", before, origin=lambda: whole.origin)
+    assert_same(read_stored(tmp_path / "r.npz", Record), whole)
+
+
 def test_counts_take_the_smallest_type(tmp_path):
     for top, dtype in ((127, np.int8), (128, np.int16), (2**15, np.int32)):
         counts = Channel(np.array([0, top], np.int32))
