@@ -16,7 +16,6 @@ import errno
 import json
 import os
 import shutil
-import struct
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
@@ -145,20 +144,11 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
             for k, (kind, counts) in enumerate(zip(kinds, content["counts"], strict=True))
             for j, count in enumerate(counts)
         ]
-    except (
-        ValueError,
-        KeyError,
-        TypeError,
-        EOFError,
-        NotImplementedError,
-        zipfile.BadZipFile,
-        struct.error,
-    ):  # damaged: it is made again
-        return None
-    except OSError as error:
-        if error.errno not in (None, errno.EINVAL):  # a wrong offset in the file is damage, too
+    except Exception as error:
+        # a wrong offset in the file is damage, too
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
             raise
-        return None
+        return None  # whatever zipfile and numpy met in a damaged file: it is made again
     within = low_hz <= band_hz[0] and band_hz[1] <= high_hz
     return KeptBins(tuple(pieces), tuple(content["left_out"])) if within else None
 
