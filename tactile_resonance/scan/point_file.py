@@ -37,10 +37,8 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import CompressionMode, Reader, ReaderError, storage_mcap
+from rosbags.rosbag2 import CompressionMode, Reader, storage_mcap
 from rosbags.rosbag2.metadata import dump_qos_v9
-from rosbags.serde import SerdeError
-from rosbags.typesys import TypesysError
 
 from tactile_resonance.files import sync, write_whole
 from tactile_resonance.scan.messages import (
@@ -284,7 +282,7 @@ def read_content(path: Path) -> FileContent:
                 _topic_of(c, hash_of(c.msgtype, c.msgdef), c.msgcount) for c in reader.connections
             )
             return FileContent(path.name, reader.start_time, reader.end_time - 1, topics)
-    except _DAMAGE as error:
+    except Exception as error:  # whatever rosbags meets in a cut or overwritten file
         raise _damaged(path, error) from error
 
 
@@ -318,13 +316,8 @@ def read_messages(path: Path, *type_names: str) -> Iterator[tuple[int, str, Any]
                     yield time_ns, connection.topic, read[connection.id](cdr)
     except OtherVersionError as error:
         raise ValueError(f"{path.name}: {error}") from error
-    except _DAMAGE as error:
+    except Exception as error:  # whatever rosbags meets in a cut or overwritten file
         raise _damaged(path, error) from error
-
-
-# What reading a cut or overwritten file has been seen to raise.
-_DAMAGE = (ReaderError, SerdeError, TypesysError, OSError, ValueError, TypeError, KeyError,
-           IndexError, AssertionError, EOFError, MemoryError, OverflowError, struct.error)  # fmt: skip
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
