@@ -113,6 +113,15 @@ def test_normals_scatter_as_much_as_they_are_said_to():
         assert np.std(off @ axis) == pytest.approx(found[0].std_rad, rel=0.06)
 
 
+def test_the_first_touch_lies_in_the_direction_of_the_beam():
+    point = expected([0.3, -0.2, 1.0], (0.01, 0.02, 0.03))
+    (first, *_), normal = places_around(point, FOUR), np.array(point.normal)
+    way = np.subtract(first.position_m, point.position_m)
+    heading = np.array([np.cos(0.3), np.sin(0.3), 0.0])  # of the tip, seen from above
+    beam = heading - (heading @ normal) * normal
+    np.testing.assert_allclose(way, FOUR.radius_m * beam / np.linalg.norm(beam), atol=1e-15)
+
+
 @pytest.mark.parametrize("hollow", [False, True])
 def test_error_on_a_sphere_of_10_mm_is_that_of_its_closed_form(hollow):
     # the ball's centres lie on a sphere of 12.5 mm, or of 7.5 mm inside of the hollow
