@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,14 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.contact.vectors import Six
 from tactile_resonance.fields import (
     AboveZero,
     Checked,
     Range,
     build,
     number,
-    read_dataclass,
+    numbers,
     read_yaml,
     require,
 )
@@ -291,14 +290,6 @@ def read_table(path: Path, base_frame: str) -> list[float]:
     content = read_yaml(path)
     form = content.get("format")
     require(form == FORMAT, f"{path}: format", form, f"{FORMAT!r}, as calibrate_table writes it")
-    read = {item.name: content.get(item.name) for item in fields(_Table)}  # the rest is for people
-    table = read_dataclass(_Table, read, f"{path}:")
-    accepted = f"{base_frame!r}, the robot's base here"
-    require(table.base_frame == base_frame, f"{path}: base_frame", table.base_frame, accepted)
-    return list(table.table_in_base)
-
-
-@dataclass(frozen=True)
-class _Table:
-    table_in_base: Six
-    base_frame: str
+    base = content.get("base_frame")  # what else the file holds is for people
+    require(base == base_frame, f"{path}: base_frame", base, f"{base_frame!r}, the robot's base here")
+    return list(numbers(content.get("table_in_base"), f"{path}: table_in_base", 6))
