@@ -24,7 +24,7 @@ from zlib import crc32
 
 from rosbags.serde import SerdeError
 
-from tactile_resonance.fields import counted, read_dataclass, whole
+from tactile_resonance.fields import counted, read, whole
 from tactile_resonance.files import write_whole
 from tactile_resonance.scan.messages import definition_and_hash, message_types
 from tactile_resonance.scan.point_file import (
@@ -157,11 +157,11 @@ def read_run(path: Path) -> RunContent:
     files, results, unchecked = [], [], 0
     with ThreadPoolExecutor() as pool:  # a checksum holds no lock of the interpreter
         of_files = [entries.get(f"{RECORDING}/{file.name}") for file in paths]
-        for read in pool.map(_finished, paths, of_files, repeat(len(run.points))):
-            if isinstance(read, str):
-                problems.append(read)
+        for each in pool.map(_finished, paths, of_files, repeat(len(run.points))):
+            if isinstance(each, str):
+                problems.append(each)
                 continue
-            content, result, checked = read
+            content, result, checked = each
             files.append(content)
             unchecked += not checked
             if result is not None:
@@ -227,15 +227,8 @@ def read_plan(path: Path) -> RunContent:
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT!r}")
         scene = (path / SCENE).read_text(encoding="utf-8")
-        points, places = (
-            tuple(
-                read_dataclass(ScanPoint, point, f"{name}[{i}]") for i, point in enumerate(listed)
-            )
-            for name, listed in (
-                ("points", content["points"]),
-                ("places", content.get("places", ())),
-            )
-        )
+        points = read(tuple[ScanPoint, ...], content["points"], "points")
+        places = read(tuple[ScanPoint, ...], content.get("places", ()), "places")
         facts = content["facts"]
         written = content.pop(CHECKSUM, None)  # earlier versions wrote none
         problems = () if written in (None, checksum_of(content)) else (PLAN_DAMAGED,)
