@@ -244,6 +244,14 @@ def known(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def read_or_unknown(value: object, field: str) -> float:
+    """The number; NaN, as `known` writes it, for None."""
+    return math.nan if value is None else number(value, field)
+
+
+OrUnknown = Annotated[float, read_or_unknown]
+
+
 def numbers(value: Any, field: str, count: int | None = None) -> tuple[float, ...]:
     """Return a list, or an array (n,), of finite numbers as a tuple, of length `count` where that is given."""
     value = value.tolist() if getattr(value, "ndim", None) == 1 else value

@@ -19,9 +19,9 @@ The file of a `CalibratedSensor` is what `tactile_resonance calibrate` writes.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +30,11 @@ from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
 from tactile_resonance.fields import (
     AboveZero,
     Checked,
-    NotNegative,
+    OrUnknown,
+    build,
     known,
+    number,
+    read,
     read_dataclass,
     read_yaml,
     require,
@@ -41,6 +44,7 @@ from tactile_resonance.strict_yaml import dump_yaml
 PER_MODE = ("natural_rad_s", "damping_ratio", "coupling_rad_s", "tip_deflection")
 SINGLE = ("feedthrough", "leak_rad_s", "gain", "delay_s")
 FORMAT = "tactile_resonance sensor calibration 1"
+T = TypeVar("T")
 _HEADER = """\
 # A calibrated sensor: `tactile_resonance calibrate` wrote this. Rows of `covariance`, entries of `determined`:
 # those of natural_rad_s, damping_ratio, coupling_rad_s, tip_deflection (a mode each), feedthrough,
@@ -91,6 +95,14 @@ class ContactStiffness:
 AIR = ContactStiffness()
 
 
+def _read_single(value: object, field: str) -> FloatArray:
+    return np.array(number(value, field))
+
+
+def _read_flags(value: object, field: str) -> BoolArray:
+    return np.array(read(tuple[bool, ...], value, field))
+
+
 @dataclass(frozen=True, eq=False)
 class SensorModel:
     """Parameters of one sensor, or of a stack of them: leading axes (...) of all fields.
@@ -118,10 +130,10 @@ class SensorModel:
     damping_ratio: FloatArray
     coupling_rad_s: FloatArray
     tip_deflection: FloatArray
-    feedthrough: FloatArray
-    leak_rad_s: FloatArray
-    gain: FloatArray
-    delay_s: FloatArray
+    feedthrough: Annotated[FloatArray, _read_single]
+    leak_rad_s: Annotated[FloatArray, _read_single]
+    gain: Annotated[FloatArray, _read_single]
+    delay_s: Annotated[FloatArray, _read_single]
 
     @property
     def modes(self) -> int:
@@ -246,9 +258,9 @@ class Calibration:
 
     model: SensorModel
     covariance: FloatArray
-    determined: BoolArray
+    determined: Annotated[BoolArray, _read_flags]
     band_hz: tuple[float, float]
-    noise_v_per_root_hz: float
+    noise_v_per_root_hz: OrUnknown
     excess: float
     message: str = ""
 
@@ -272,7 +284,7 @@ class Calibration:
 
 
 @dataclass(frozen=True, eq=False)
-class CalibratedSensor:
+class CalibratedSensor(Checked):
     """Content of a file.
 
     Attributes
@@ -287,10 +299,10 @@ class CalibratedSensor:
     """
 
     calibration: Calibration
-    tip_radius_m: float
-    tip_mass_kg: float
-    tip_mass_std_kg: float
-    about: dict[str, Any]
+    tip_radius_m: AboveZero
+    tip_mass_kg: OrUnknown = math.nan
+    tip_mass_std_kg: OrUnknown = math.nan
+    about: dict[str, Any] = field(default_factory=dict)
 
     def as_text(self) -> str:
         """Content of the file."""
@@ -324,67 +336,42 @@ def read_calibration(path: Path) -> CalibratedSensor:
     ValueError
         If it cannot be read, or is something else; names field, value and what is accepted.
     """
-    content = read_yaml(path)
-    form = content.get("format")
+    content, where = read_yaml(path), f"{path.name}:"
+    form = content.pop("format", None)
     accepted = f"{FORMAT!r}, as tactile_resonance calibrate writes it"
     require(form == FORMAT, f"{path}: format", form, accepted)
-    own = set(_File.__dataclass_fields__)
-    file = read_dataclass(_File, {k: v for k, v in content.items() if k in own}, f"{path.name}:")
-    about = {k: v for k, v in content.items() if k not in own and k != "format"}
-    noise, mass_kg, mass_std_kg = (
-        math.nan if value is None else value
-        for value in (file.noise_v_per_root_hz, file.tip_mass_kg, file.tip_mass_std_kg)
-    )
-    calibration = Calibration(
-        SensorModel(*(np.asarray(getattr(file, name)) for name in (*PER_MODE, *SINGLE))),
-        file.covariance,
-        np.array(file.determined),
-        file.band_hz,
-        noise,
-        file.excess,
-        file.message,
-    )
-    return CalibratedSensor(calibration, file.tip_radius_m, mass_kg, mass_std_kg, about)
+
+    def part(kind: type[T], **given: object) -> T:
+        own = {f.name for f in fields(kind)} - given.keys() & content.keys()  # type: ignore[arg-type]
+        return read_dataclass(kind, {name: content.pop(name) for name in own}, where, **given)
+
+    calibration = part(Calibration, model=part(SensorModel))
+    build(_check_content, where, calibration)
+    return part(CalibratedSensor, calibration=calibration, about=content)
 
 
-@dataclass(frozen=True, eq=False)
-class _File(Checked):
-    tip_radius_m: AboveZero
-    band_hz: tuple[float, float]
-    noise_v_per_root_hz: AboveZero | None
-    excess: AboveZero
-    message: str
-    natural_rad_s: FloatArray
-    damping_ratio: FloatArray
-    coupling_rad_s: FloatArray
-    tip_deflection: FloatArray
-    feedthrough: float
-    leak_rad_s: NotNegative
-    gain: AboveZero
-    delay_s: float
-    determined: tuple[bool, ...]
-    covariance: FloatArray
-    tip_mass_kg: float | None = None
-    tip_mass_std_kg: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        modes = self.natural_rad_s.size
-        require(modes > 0, "natural_rad_s", [], "a list of one mode or more")
-        for name in PER_MODE:
-            of = getattr(self, name)
-            require(of.shape == (modes,), name, of.tolist(), f"a list of {modes} numbers")
-            good = name == "tip_deflection" or bool(np.all(of > 0))
-            require(good, name, of.tolist(), "numbers above 0")
-        rising = bool(np.all(np.diff(self.natural_rad_s) > 0))
-        require(rising, "natural_rad_s", self.natural_rad_s.tolist(), "ascending frequencies")
-        size = 4 * modes + 4
-        require(len(self.determined) == size, "determined", len(self.determined), f"{size} entries")
-        shape = self.covariance.shape
-        require(shape == (size, size), "covariance", shape, f"{size} rows of {size} numbers")
-        variances = np.diag(self.covariance)
-        # what is all but uncorrelated differs by the rounding of an inverse
-        rounding = 1e-6 * np.sqrt(np.outer(variances, variances))
-        good = bool(np.all(variances >= 0))
-        good = good and bool(np.all(np.abs(self.covariance - self.covariance.T) <= rounding))
-        require(good, "covariance", "another matrix", "a symmetric one with variances, 0 or above")
+def _check_content(made: Calibration) -> None:
+    """Raise ``ValueError`` where the numbers of a file are not those of one sensor."""
+    model, modes = made.model, made.model.natural_rad_s.size
+    require(modes > 0, "natural_rad_s", [], "a list of one mode or more")
+    for name in PER_MODE:
+        of = getattr(model, name)
+        require(of.shape == (modes,), name, of.tolist(), f"a list of {modes} numbers")
+        good = name == "tip_deflection" or bool(np.all(of > 0))
+        require(good, name, of.tolist(), "numbers above 0")
+    rising = bool(np.all(np.diff(model.natural_rad_s) > 0))
+    require(rising, "natural_rad_s", model.natural_rad_s.tolist(), "ascending frequencies")
+    noise, gain, leak = made.noise_v_per_root_hz, float(model.gain), float(model.leak_rad_s)
+    require(not noise <= 0, "noise_v_per_root_hz", noise, "a number above 0")
+    require(made.excess > 0, "excess", made.excess, "a number above 0")
+    require(gain > 0, "gain", gain, "a number above 0")
+    require(leak >= 0, "leak_rad_s", leak, "a number, 0 or above")
+    size, shape = 4 * modes + 4, made.covariance.shape
+    require(made.determined.size == size, "determined", made.determined.size, f"{size} entries")
+    require(shape == (size, size), "covariance", shape, f"{size} rows of {size} numbers")
+    variances = np.diag(made.covariance)
+    # what is all but uncorrelated differs by the rounding of an inverse
+    rounding = 1e-6 * np.sqrt(np.outer(variances, variances))
+    good = bool(np.all(variances >= 0))
+    good = good and bool(np.all(np.abs(made.covariance - made.covariance.T) <= rounding))
+    require(good, "covariance", "another matrix", "a symmetric one with variances, 0 or above")

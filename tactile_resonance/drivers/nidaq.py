@@ -26,8 +26,8 @@ from tactile_resonance.drivers.acquisition import AcquisitionDevice, DeviceError
 from tactile_resonance.fields import (
     AboveZero,
     Checked,
+    OrUnknown,
     known_keys,
-    number,
     one_line,
     read,
     read_dataclass,
@@ -83,10 +83,6 @@ def _read_actuator(value: Any, field: str) -> InputChannel | None:
     return read_dataclass(InputChannel, channel, field) if measured else None
 
 
-def _read_delay(value: object, field: str) -> float:
-    return math.nan if value is None else number(value, field)
-
-
 @dataclass(frozen=True)
 class NiDaqConfig(Checked):
     """What `NiDaqDevice` needs to know; see ``config/devices/nidaqmx.yaml``.
@@ -113,7 +109,7 @@ class NiDaqConfig(Checked):
     between_samples: BetweenSamples
     buffer_s: AboveZero
     anti_alias_filter: str = ""
-    channel_delay_s: Annotated[float, _read_delay] = math.nan
+    channel_delay_s: OrUnknown = math.nan
     clock_device: str = ""
 
     def __post_init__(self) -> None:

@@ -14,8 +14,8 @@ from tactile_resonance.cli import main
 @pytest.fixture
 def written(fitted, bench, tmp_path):
     path = tmp_path / "sensor.yaml"
-    nan = float("nan")
-    content = CalibratedSensor(fitted.calibration, bench.sensor.tip.radius_m, nan, nan, {"sensor": "a"})
+    nan, about = float("nan"), {"sensor": "a", "model": "b"}
+    content = CalibratedSensor(fitted.calibration, bench.sensor.tip.radius_m, nan, nan, about)
     path.write_text(content.as_text())
     return path
 
@@ -28,7 +28,7 @@ def test_a_file_brings_back_what_was_written(written, fitted, bench):
     assert sensor.calibration.noise_v_per_root_hz == made.noise_v_per_root_hz
     assert sensor.tip_radius_m == bench.sensor.tip.radius_m
     assert np.isnan(sensor.tip_mass_kg)
-    assert sensor.about == {"sensor": "a"}
+    assert sensor.about == {"sensor": "a", "model": "b"}
 
 
 @pytest.mark.parametrize(
