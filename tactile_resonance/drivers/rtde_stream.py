@@ -16,7 +16,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
 from tactile_resonance.contact.clocks import ClockTracker
@@ -60,10 +60,6 @@ class RobotState(NamedTuple):
     safety_bits: int
     runtime_state: int
     robot_mode: int
-
-
-# what `RobotState` itself calls, at half of the time
-_new_state = partial(tuple.__new__, RobotState)
 
 
 class RtdeStream:
@@ -140,7 +136,7 @@ class RtdeStream:
                 at = begin
                 continue
             at += size
-            states.append(_new_state((v[3], v[4:10], v[10:16], v[16:22], *v[22:])))
+            states.append(RobotState(v[3], v[4:10], v[10:16], v[16:22], *v[22:]))
         self._buffer = buffer[at:]
         return states
 
