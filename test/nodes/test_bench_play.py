@@ -27,6 +27,7 @@ from tactile_resonance.recording.messages import record_from_message, time_from_
 from tactile_resonance.simulation.plant.defaults import MOST_STEPS, TABLE_IN_BASE
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.tabletop import PlantHistory, truth
+from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bench import (
     BenchEffects,
     BenchRun,
@@ -144,7 +145,7 @@ def test_a_sensor_that_is_not_linear_plays_on_the_contact_whose_truth_is_told(no
 
 
 def test_tissue_that_an_order_placed_is_what_the_sensor_is_on(node, monkeypatch):
-    plant = Plant(None, None, None, tip_radius_m=2.5e-3)
+    plant = Plant(None, None, Tip())
     plant.tissue = read_tissues()["cortex"]
     told = truth(plant)["tissue"]
     monkeypatch.setattr(Held, "STATE", Held.STATE | {"tissue": told})

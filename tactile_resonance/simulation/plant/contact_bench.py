@@ -336,7 +336,6 @@ class ContactBench:
     tissue : Tissue
         Everywhere under the surface.
     surface : PlantSurface
-        What takes its place later must be curved alike.
     start : Pose
         Of the tip.
     tip : Tip
@@ -372,14 +371,12 @@ class ContactBench:
         period_s: float = 0.002,
         seed: int = 0,
     ) -> None:
-        tip = Tip() if tip is None else tip
         on_tool = mount is Mount.TOOL
         tool, dish = Payload(tool_kg, (-0.03, 0.0, 0.01)), Payload(DISH_KG, (0.0, 0.0, -0.01))
         self.plant = Plant(
             surface,
             lambda _: tissue,
-            lambda found: tip.on(found, surface),
-            tip_radius_m=tip.radius_m,
+            tip or Tip(),
             mount=mount,
             carried=tool if on_tool else dish,
         )

@@ -28,7 +28,7 @@ from tactile_resonance.contact.vectors import (
 )
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
-from tactile_resonance.simulation.plant.tip import TipOnTissue
+from tactile_resonance.simulation.plant.tip import Tip, TipOnTissue
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.ur5e.poses import IDENTITY, ORIGIN, Transform, beside
 
@@ -57,13 +57,11 @@ class Plant:
     Parameters
     ----------
     surface : PlantSurface
-        May be exchanged while the plant runs (``plant.surface = ...``).
+        May be exchanged while the plant runs (``plant.surface = ...``), for what is touched next.
     tissue_at : callable
         From a position (3,) [m] in the base to the tissue under it; None where there is nothing to
         touch. Asked when the tip comes near at a new place, and where it stops to come down.
-    tip : callable
-        From a tissue to a `TipOnTissue` at rest on it; its ball is that of `relative_radius_m`.
-    tip_radius_m : float
+    tip : Tip
     mount : Mount
         Of the cell, whose frame is that of the tip or the base.
     carried : Payload
@@ -104,18 +102,17 @@ class Plant:
         self,
         surface: PlantSurface,
         tissue_at: Callable[[FloatArray], Tissue | None],
-        tip: Callable[[Tissue], TipOnTissue],
+        tip: Tip,
         *,
-        tip_radius_m: float,
         mount: Mount = Mount.TABLE,
         carried: Payload = _NOTHING,
         friction: float = 0.1,
     ) -> None:
-        require(0 < tip_radius_m < math.inf, "tip_radius_m", tip_radius_m, "a number above 0")
+        require(0 < tip.radius_m < math.inf, "tip.radius_m", tip.radius_m, "a number above 0")
         self.surface = surface
         self.motion: SurfaceMotion | None = None
         self.tissue_at = tissue_at
-        self.tip_radius_m = tip_radius_m
+        self.tip = tip
         self.mount, self.carried = mount, carried
         self.friction = friction
         self.time_s = 0.0
@@ -126,7 +123,6 @@ class Plant:
         self.contact_s = 0.0
         self.tip_m = ORIGIN
         self.normal_force_n = 0.0
-        self._tip = tip
         self.tissue: Tissue | None = None
         self._on: TipOnTissue | None = None
         self.site_m: Vector | None = None
@@ -153,7 +149,7 @@ class Plant:
         height, normal = self.surface.height_of(place)
         if self.motion is not None:
             height -= self.motion.displacement_m(self.time_s)
-        depth = self.tip_radius_m - height
+        depth = self.tip.radius_m - height
         pushed = held = 0.0
         self._find_tissue(place, height, normal, way)
         if self._on is not None:
@@ -177,7 +173,7 @@ class Plant:
             self.force_n = (pushed * nx + x, pushed * ny + y, pushed * nz + z)
             self._held_n = (held * nx + x, held * ny + y, held * nz + z)
             # the ball is touched at its lowest point
-            radius = -self.tip_radius_m
+            radius = -self.tip.radius_m
             self.torque_nm = cross((radius * nx, radius * ny, radius * nz), (x, y, z))
         if self.mount is Mount.TOOL:
             carried_m = added(place, rotated(self._turn, self.carried.centre_m))
@@ -219,20 +215,20 @@ class Plant:
 
     def _find_tissue(self, place: Vector, height: float, normal: Vector, way: Vector) -> None:
         """Tissue remembers a touch at the same place; elsewhere it is fresh, and what lies exactly there."""
-        if self.in_contact or height > self.tip_radius_m + NEAR_M:
+        if self.in_contact or height > self.tip.radius_m + NEAR_M:
             return
         if self.site_m is not None:
             away_m = math.hypot(*beside(difference(place, self.site_m), normal))
             if self._site_touched:
-                known = away_m < SAME_PLACE * self.tip_radius_m
+                known = away_m < SAME_PLACE * self.tip.radius_m
             else:  # it is not asked for all along the way: that may take longer than a step
                 moved_m = math.hypot(*beside(way, normal))
-                known = away_m < (STANDING_M if moved_m < STANDING_M else self.tip_radius_m)
+                known = away_m < (STANDING_M if moved_m < STANDING_M else self.tip.radius_m)
             if known:
                 return
         tissue = self.tissue_at(np.array(place))
         if tissue != self.tissue or self._site_touched:  # else the beam goes on swinging
-            self._on = None if tissue is None else self._tip(tissue)
+            self._on = None if tissue is None else self.tip.on(tissue, self.surface)
         self.tissue = tissue
         self.site_m, self._site_touched = place, False
 

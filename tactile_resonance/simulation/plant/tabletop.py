@@ -30,7 +30,7 @@ from tactile_resonance.simulation.plant.defaults import MOST_STEPS
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
-from tactile_resonance.simulation.plant.tip import Tip, TipOnTissue
+from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import TissueLibrary
@@ -155,12 +155,7 @@ def table_plant(
         Of the cell.
     """
     beam, nu = None if rigid_tip else sensor_modes(sensor), library.contact.poisson_ratio
-    tip = Tip(sensor.tip.radius_m, beam, nu)
-
-    def on(tissue: Tissue) -> TipOnTissue:
-        return tip.on(tissue, surface)
-
-    plant = Plant(surface, tissue_at, on, tip_radius_m=tip.radius_m, mount=mount)
+    plant = Plant(surface, tissue_at, Tip(sensor.tip.radius_m, beam, nu), mount=mount)
     plant.motion = motion
     return plant
 

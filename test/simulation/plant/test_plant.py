@@ -10,17 +10,18 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import Payload
 from tactile_resonance.contact.vectors import vector
+from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.plant import SLIP, Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
 from tactile_resonance.simulation.plant.tip import (
     BONE_PA,
     BONE_POISSON_RATIO,
     OnSoft,
-    RigidTip,
     SprungIndenter,
     Tip,
     bone,
 )
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
@@ -31,13 +32,12 @@ SOFT = Tissue("soft", 5e3, (0.3,), (1.5,))
 G = 9.80665
 
 
-def rigid(tissue):
-    return RigidTip(Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=NU))
+RIGID = Tip(RADIUS_M, poisson_ratio=NU)
 
 
-def plant(tissue=ELASTIC, *, surface=None, tip=rigid, **options):
+def plant(tissue=ELASTIC, *, surface=None, tip=RIGID, **options):
     surface = PlantSurface.tilted(0.0) if surface is None else surface
-    return Plant(surface, lambda _: tissue, tip, tip_radius_m=RADIUS_M, **options)
+    return Plant(surface, lambda _: tissue, tip, **options)
 
 
 def at(*place, turn=(0.0, 0.0, 0.0)):
@@ -84,8 +84,7 @@ def sphere(centre_m, radius_m, hollow):
 @pytest.mark.parametrize("polar_rad", [0.0, 0.5])
 def test_sphere_pushes_along_its_own_normal_with_the_force_of_two_curved_bodies(hollow, polar_rad):
     surface = sphere(CENTRE_M, CURVED_M, hollow)
-    tip = Tip(RADIUS_M, poisson_ratio=NU)
-    p = plant(surface=surface, tip=lambda t: tip.on(t, surface), friction=0.0)
+    p = plant(surface=surface, friction=0.0)
     # from the centre to the contact; the tissue is inside of the sphere, or outside of the hollow
     out = np.array([np.sin(polar_rad), 0, np.cos(polar_rad)]) * (-1 if hollow else 1)
     normal = -out if hollow else out
@@ -97,6 +96,17 @@ def test_sphere_pushes_along_its_own_normal_with_the_force_of_two_curved_bodies(
     want = 4 / 3 * 10e3 / (1 - NU**2) * np.sqrt(radius) * 4e-4**1.5
     np.testing.assert_allclose(p.force_n, want * normal, rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(p.torque_nm, 0, atol=1e-12)
+
+
+def test_a_plane_in_place_of_a_dome_is_pressed_as_a_plane():
+    p = plant(surface=sphere(np.zeros(3), CURVED_M, False))
+    top_m = CURVED_M + RADIUS_M
+    for height in (1e-3, -4e-4, 1e-3):
+        p.step(at(0, 0, top_m + height), 0.002)
+    p.surface = PlantSurface.tilted(0.0)
+    for height in (1e-3, 0.0, -4e-4):
+        p.step(at(5e-3, 0, RADIUS_M + height), 0.002)
+    assert p.normal_force_n == pytest.approx(hertz(4e-4), rel=1e-4)
 
 
 def test_sphere_without_bounds_is_a_plane_and_a_ball_must_fit_into_its_hollow():
@@ -175,8 +185,7 @@ def test_what_is_felt_is_what_lies_under_the_touch_not_where_the_tip_came_near()
     p = Plant(
         PlantSurface.tilted(0.0),
         lambda place: Tissue("slope", 10e3 * (1 + 100 * place[0]), (), ()),
-        rigid,
-        tip_radius_m=RADIUS_M,
+        RIGID,
     )
     p.step(at(-2e-3, 0, RADIUS_M + 3e-3), 0.002)
     for x in (0.0, 1e-3, 1.5e-3):
@@ -191,7 +200,7 @@ def test_what_is_felt_is_what_lies_under_the_touch_not_where_the_tip_came_near()
 
 
 def test_nothing_there_is_nothing_felt():
-    p = Plant(PlantSurface.tilted(0.0), lambda _: None, rigid, tip_radius_m=RADIUS_M)
+    p = Plant(PlantSurface.tilted(0.0), lambda _: None, RIGID)
     p.step(at(0, 0, 0), 0.002)
     np.testing.assert_array_equal(p.force_n, 0)
 
@@ -225,19 +234,14 @@ def test_cell_on_the_tool_feels_contact_weight_and_inertia_in_its_own_frame():
 
 
 def test_beam_in_series_is_softer_by_its_own_compliance():
-    stiffness = 14.8
-
-    def sprung(tissue):
-        ball = Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=NU)
-        return SprungIndenter(
-            ball, stiffness_n_per_m=stiffness, mass_kg=2.6e-4, damping_ns_per_m=0.02
-        )
-
-    p = plant(tip=sprung)
-    for height in [*np.linspace(1e-3, -8e-4, 400), *[-8e-4] * 500]:
+    beam = sensor_modes(read_sensor())
+    p = plant(tip=Tip(RADIUS_M, beam, NU))
+    for height in [*np.linspace(1e-3, -8e-4, 400), *[-8e-4] * 2000]:
         p.step(at(0, 0, RADIUS_M + height), 0.002)
     # what the beam bends by is what the ball stays behind
-    assert p.force_n[2] == pytest.approx(stiffness * (8e-4 - p.depth_m), rel=1e-4)
+    assert p.force_n[2] == pytest.approx(
+        beam.static_stiffness_n_per_m * (8e-4 - p.depth_m), rel=1e-4
+    )
     assert p.force_n[2] == pytest.approx(hertz(p.depth_m), rel=1e-4)
 
 
@@ -245,15 +249,13 @@ def test_beam_keeps_swinging_while_the_tip_comes_down_along_a_tilt():
     """Its swing is the beam's, not the tissue's: the same tissue asked for again does not stop it."""
     made = []
 
-    def sprung(tissue):
-        ball = Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=NU)
-        made.append(
-            SprungIndenter(ball, stiffness_n_per_m=14.8, mass_kg=2.6e-4, damping_ns_per_m=0.02)
-        )
-        return made[-1]
+    def counted(ball):
+        made.append(ball)
+        return ball
 
+    tip = Tip(RADIUS_M, sensor_modes(read_sensor()), NU, meets=counted)
     tilted = PlantSurface.tilted(0.0, np.deg2rad(10.0))
-    p = Plant(tilted, lambda _: Tissue("soft", 10e3, (), ()), sprung, tip_radius_m=RADIUS_M)
+    p = Plant(tilted, lambda _: Tissue("soft", 10e3, (), ()), tip)
     for height in np.linspace(4e-3, -3e-4, 500):
         p.step(at(0, 0, RADIUS_M + height), 0.002)
     assert p.in_contact

@@ -9,9 +9,8 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import LaidScene, PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tabletop import move_surface, table_plant
-from tactile_resonance.simulation.plant.tip import RigidTip
+from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
 
@@ -68,11 +67,7 @@ def test_a_tip_that_stands_is_pressed_as_the_tissue_rises():
     tilt, depth_m = 0.2, 3e-4
     surface = PlantSurface.tilted(0.1, tilt)
     tissue = Tissue("elastic", MODULUS_PA, (), ())
-
-    def tip(found):
-        return RigidTip(Indenter(found, tip_radius_m=RADIUS_M, poisson_ratio=NU))
-
-    plant = Plant(surface, lambda _: tissue, tip, tip_radius_m=RADIUS_M)
+    plant = Plant(surface, lambda _: tissue, Tip(RADIUS_M, poisson_ratio=NU))
     plant.motion = motion = SurfaceMotion(breath_m=2e-4, heart_m=1e-4)
     place = surface.point_m + surface.normal * (RADIUS_M - depth_m)
     forces, times = [], []

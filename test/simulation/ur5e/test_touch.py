@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
-from tactile_resonance.simulation.plant.tip import RigidTip
+from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.ur5e.controller import SafetyMode
 from tactile_resonance.simulation.ur5e.machine import MachineConfig
 
@@ -34,12 +33,8 @@ def hertz(depth_m: float) -> float:
 @pytest.fixture
 def plant() -> Plant:
     rubber = Tissue("rubber", MODULUS_PA, (), ())
-    return Plant(
-        PlantSurface.tilted(TOUCH_Z - RADIUS_M),
-        lambda _: rubber,
-        lambda tissue: RigidTip(Indenter(tissue, tip_radius_m=RADIUS_M, poisson_ratio=POISSON)),
-        tip_radius_m=RADIUS_M,
-    )
+    tip = Tip(RADIUS_M, poisson_ratio=POISSON)
+    return Plant(PlantSurface.tilted(TOUCH_Z - RADIUS_M), lambda _: rubber, tip)
 
 
 @pytest.fixture
