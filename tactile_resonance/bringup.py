@@ -212,6 +212,7 @@ def plan_bringup(
     mock = hardware == "true"
     robot = given.get("robot") or _robot(plan.stated, mock)
     require(mock or robot != "ideal", "robot", robot, "true or false without the simulated bench")
+    require(robot in ("true", "ideal", "false"), "robot", robot, "one of true, ideal, false")
     for argument, (name, *its_nodes) in ARGUMENTS.items():
         for node in its_nodes if argument in given else ():
             pass_on(node, argument, **{name: given[argument]})
@@ -280,7 +281,9 @@ def _pass_mock(plan: _Decisions, robot: str, priority: bool) -> bool:
     if value("contact_node", "force_config") in (None, SIMULATED_CELL):
         pass_on("contact_node", "", force_host=host)
     clock = plan.stated["fake_hardware_node"].get("use_sim_time", True)
-    simulated_time = given.get("real_time", "false" if clock else "true") == "false"
+    real_time = given.get("real_time", "false" if clock else "true")
+    require(real_time in ("true", "false"), "real_time", real_time, "true or false")
+    simulated_time = real_time == "false"
     for node in NODES:
         pass_on(node, "real_time", use_sim_time=simulated_time)
     for node in IN_BENCH_TIME:

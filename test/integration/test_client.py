@@ -107,3 +107,12 @@ def test_the_bench_takes_the_arguments_of_the_launch_file_or_refuses_them(tmp_pa
     monkeypatch.setattr(sys, "argv", [str(BENCH), "namespace:=left"])
     with pytest.raises(SystemExit, match=r"^namespace: not among "):
         runpy.run_path(str(BENCH))
+    for wrong, told in (
+        ("robot", r"^robot: expected NAME:=VALUE"),
+        ("robot:=maybe", r"^robot: got 'maybe'; accepted is one of true, ideal, false$"),
+        ("real_time:=yes", r"^real_time: got 'yes'; accepted is true or false$"),
+        ("params_file:=none.yaml", r"^params_file: none.yaml: "),
+    ):
+        monkeypatch.setattr(sys, "argv", [str(BENCH), wrong])
+        with pytest.raises(SystemExit, match=told):
+            runpy.run_path(str(BENCH))
