@@ -24,6 +24,9 @@ from tactile_resonance.processes import ENDING, keep_memory
 
 RCLError = rclpy_implementation.RCLError
 
+UNUSABLE = (ValueError, OSError, DeviceError, ParameterException, NameValidationException, RCLError)
+"""What a start may be refused with, in one line; anything else is a defect and keeps its traceback."""
+
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """This machine's clock, for timers that must go on while simulated time stands."""
 
@@ -121,9 +124,6 @@ def run_node(make: Callable[[], Node]) -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         # the interpreter, as it ends, takes handlers away
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except (
-        *(ValueError, OSError, DeviceError),
-        *(ParameterException, NameValidationException, RCLError),
-    ) as error:
+    except UNUSABLE as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)

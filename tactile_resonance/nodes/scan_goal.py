@@ -10,6 +10,7 @@ from tactile_resonance.action import Scan
 from tactile_resonance.client import Ending, ScanOutcome
 from tactile_resonance.nodes.client import NoAnswer, ScanClient
 from tactile_resonance.nodes.parameters import Fixed, declare, values
+from tactile_resonance.nodes.running import UNUSABLE
 from tactile_resonance.processes import noting_signals
 
 PARAMETERS = (
@@ -94,7 +95,7 @@ def main() -> None:
         sys.exit(0 if outcome.ending is Ending.COMPLETE else 1)
     except KeyboardInterrupt:
         sys.exit(130)  # the scan goes on without it
-    except (NoAnswer, ValueError) as error:
+    except (NoAnswer, *UNUSABLE) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)
 

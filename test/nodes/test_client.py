@@ -4,6 +4,7 @@
 import json
 import math
 import os
+import sys
 import threading
 import time
 from pathlib import Path
@@ -521,3 +522,22 @@ def test_scan_goal_needs_no_manager(stack, monkeypatch, tmp_path):
         stack.own.shutdown()
         spinning.join()
     assert str(ended.value).startswith(f"rejected: {tmp_path / 'none.yaml'}: cannot be read")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["-p", "start_within_s:=0"], "'0' of type 'INTEGER', expecting type 'DOUBLE': start_within_s"),
+        (["-p", "start_within_s:=0.0"], "start_within_s out of range"),
+        (["--params-file", "none.yaml"], "none.yaml"),
+    ],
+)
+def test_scan_goal_refuses_in_one_line_what_it_cannot_use(given, told, monkeypatch, capsys):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain_id(os.environ)))
+    monkeypatch.setattr(sys, "argv", ["scan_goal", "--ros-args", *given])
+    with pytest.raises(SystemExit) as ended:
+        scan_goal.main()
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    assert told in said
+    assert said.count("\n") == 1
