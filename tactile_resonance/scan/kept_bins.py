@@ -183,6 +183,7 @@ def keep_bins(
     band_hz: tuple[float, float],
     each: Callable[[Callable, Iterable], Iterable] = map,
     progress: Callable[[str, int, int], None] = lambda what, done, of: None,
+    folder: Path | None = None,
 ) -> KeptBins:
     """Make ``bins.npz`` of a run, of the latest attempt at each finished point.
 
@@ -194,6 +195,8 @@ def keep_bins(
         As `map`, in whatever processes.
     progress : callable
         Told what is done, how many points are, and of how many.
+    folder : Path, optional
+        Of the file; that of the run when absent.
 
     Raises
     ------
@@ -216,11 +219,11 @@ def keep_bins(
             else:
                 yield found
 
-    return write_bins(run, rows(), band_hz, files, left_out)
+    return write_bins(folder or run, rows(), band_hz, files, left_out)
 
 
 def write_bins(
-    run: Path,
+    folder: Path,
     found: Iterable[tuple[BinsKind, npt.NDArray]],
     band_hz: tuple[float, float],
     files: dict[str, int],
@@ -235,7 +238,7 @@ def write_bins(
         return KeptBins((), tuple(left_out))
     waiting: dict[BinsKind, list[npt.NDArray]] = {}  # in the order in which kinds came first
     pieces: dict[BinsKind, list[tuple[str, int]]] = {}  # name and rows of each
-    with whole_npz(run / NAME) as members:
+    with whole_npz(folder / NAME) as members:
 
         def write(kind: BinsKind) -> None:
             rows, of_kind = np.concatenate(waiting[kind]), pieces.setdefault(kind, [])
@@ -261,7 +264,7 @@ def write_bins(
         }
         write_array(members, "kinds", np.array(json.dumps(content)))
     crc = _kinds_crc(members)
-    made = (Piece(kind, run / NAME, *piece, crc) for kind in waiting for piece in pieces[kind])
+    made = (Piece(kind, folder / NAME, *piece, crc) for kind in waiting for piece in pieces[kind])
     return KeptBins(tuple(made), tuple(left_out))
 
 

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 import zipfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
 from functools import lru_cache
 from multiprocessing import active_children
 from pathlib import Path
@@ -137,10 +139,17 @@ def reidentify(
     ]
     dtype = row_type(max(each.order // 2 for each in structures))
     counts, left_out = Counter[str](), list[str]()
-    with _Processes() as processes:
+    with _Processes() as processes, ExitStack() as scratch:
         kept = []
         for run, band, model in zip(runs, bands, structures, strict=True):
-            kept.append(kept_bins(run, band) or keep_bins(run, band, processes.in_order, progress))
+            bins = kept_bins(run, band)
+            if bins is None:
+                folder = run
+                if not os.access(run, os.W_OK):  # as of an archive
+                    beside = tempfile.TemporaryDirectory(dir=csv.parent)
+                    folder = Path(scratch.enter_context(beside))
+                bins = keep_bins(run, band, processes.in_order, progress, folder)
+            kept.append(bins)
             left_out += [f"{run}: {text}" for text in kept[-1].left_out]
             for piece in kept[-1].pieces:
                 _plan(piece.kind, band, model)  # raises what does not suit

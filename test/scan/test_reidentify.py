@@ -8,6 +8,7 @@ import errno
 import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -191,6 +192,22 @@ def test_the_npz_holds_the_same_and_several_runs_go_into_one(runs, tmp_path):
     for name in set(points.dtype.names) - {"run", "poles_status"}:
         np.testing.assert_allclose([float(row[name]) for row in rows], points[name], rtol=1e-11)
     assert [row["run"] for row in rows].count(str(runs[1])) == 2
+
+
+def test_a_run_that_cannot_be_written_is_read(runs, tmp_path, monkeypatch):
+    without = shutil.ignore_patterns("bins.npz")
+    runs = [shutil.copytree(run, tmp_path / run.name, ignore=without) for run in runs]
+    before = [sorted(run.rglob("*")) for run in runs]
+    monkeypatch.setattr(reidentify.os, "access", lambda path, mode: path not in runs)
+    (tmp_path / "out").mkdir()
+    given = ["--output", str(tmp_path / "out" / "archived")]
+    assert main(["reidentify", *map(str, runs), *given]) == 0
+    assert [sorted(run.rglob("*")) for run in runs] == before
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"archived.csv", "archived.npz"}
+    monkeypatch.undo()
+    assert main(["reidentify", *map(str, runs), "--output", str(tmp_path / "usual")]) == 0
+    assert (tmp_path / "usual.csv").read_bytes() == (tmp_path / "out" / "archived.csv").read_bytes()
+    assert (runs[0] / "bins.npz").is_file()
 
 
 def test_bins_are_made_once_and_again_for_a_wider_band_or_when_the_run_has_grown(tmp_path, capsys):
