@@ -54,8 +54,7 @@ def entry(function: Callable) -> Callable:
 
 def _plain(array: npt.NDArray) -> npt.NDArray:
     """`numpy.require` takes a microsecond to see that nothing is to be done."""
-    flags = array.flags
-    return array if flags.c_contiguous and flags.writeable else np.array(array, order="C")
+    return array if array.flags.carray else np.array(array, order="C")
 
 
 def rehearse() -> None:

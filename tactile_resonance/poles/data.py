@@ -81,7 +81,7 @@ class BinData(NamedTuple):
         places = np.arange(y.shape[-1]) if order is None else order
         one, none = np.ones((len(y), 1)), np.empty((len(y), 0))
         plain = cls(y, _plain(u, complex), places, undriven, one, one, none, none.astype(complex))
-        return plain.weighted(**variances)
+        return plain.weighted(**variances) if variances else plain
 
     def weighted(self, **variances: npt.ArrayLike) -> BinData:
         """With other variances, (points, bins or 1 or 0) each."""

@@ -44,7 +44,7 @@ def minimise(
 
 def refit_failed(problem: Problem, solution: Solution, data: BinData) -> None:
     """Fit the points that did not converge again, at full precision, in place."""
-    for k in np.flatnonzero(~solution.converged & solution.plain):
+    for k in (~solution.converged & solution.plain).nonzero()[0]:
         found = least_squares(problem, data.rows(slice(k, k + 1)))
         if found.converged[0]:
             solution.put(np.array([k]), found)

@@ -157,6 +157,7 @@ class JointPlan(FitPlan):
         u, y = self._checked(u, y)
         return self._poles(u[..., None, :], y[..., None, :], METHOD)
 
+    @np.errstate(divide="ignore", invalid="ignore", over="ignore")
     def _poles(self, u: ComplexArray, y: ComplexArray, method: str) -> PolesBatch:
         *shape, records, size = y.shape
         u, y = (values.reshape(-1, records, size) for values in (u, y))

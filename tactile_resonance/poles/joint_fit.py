@@ -115,7 +115,7 @@ class _Round:
     def lines(self) -> IntArray:
         """(batch,) excited lines; 0 of points of which a bin is not finite."""
         lines = np.full(self.kind.size, self.plan.excited_at.size)
-        for k in np.flatnonzero(~np.isfinite(self.solution.cost)):
+        for k in (~np.isfinite(self.solution.cost)).nonzero()[0]:
             y, u = self.plain.y[k], self.plain.u[k]
             lines[k] *= bool(np.isfinite(y).all() and np.isfinite(u).all())
         return lines
@@ -186,7 +186,7 @@ class _Round:
     def at_modes(self, scale: FloatArray) -> FloatArray:
         """(batch,) factor of the covariance from noise of this level; see `noise_level.noise_at_modes`."""
         factor = np.ones(scale.size)
-        rows = np.flatnonzero((self.kind > 0) & _may_return(self.solution))
+        rows = ((self.kind > 0) & self.solution.converged).nonzero()[0]
         if rows.size and self.data.undriven:  # one level for all flat bins is known well enough
             part = 1.0 if self.share is None else self.share[rows]
             at = self.data.rows(rows), self.solution.rows(rows), scale[rows]
@@ -225,7 +225,6 @@ class _Round:
         )
 
 
-@np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def fit_records(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Judged:
     """Fits of points.
 
@@ -262,7 +261,7 @@ def _without_rounding(plan: JointPlan, u: ComplexArray) -> ComplexArray:
         return u
     # one bin of either kind rules most records out
     other, line = (np.abs(u[:, 0, at[0]]) ** 2 for at in (plan.others_at, plan.excited_at))
-    rows = np.flatnonzero(other <= np.sqrt(ROUNDED) * line)
+    rows = (other <= ROUNDED**0.5 * line).nonzero()[0]
     if not rows.size:
         return u
     between, driven = (
@@ -283,7 +282,7 @@ def _worth(fitted: _Round, returns: int = MOST_RETURNS, changed: BoolArray | boo
     """
     judge, solution = _alone if fitted.plain.records == 1 else _several, fitted.solution
     badly = (fitted.level < 1 - SAME_LEVEL) | ((fitted.kind > 0) & changed & (judge is _alone))
-    rows = np.flatnonzero((badly & _may_return(solution)) | ~solution.plain)
+    rows = ((badly & solution.converged) | ~solution.plain).nonzero()[0]
     if not (rows.size and returns):
         return judge(fitted)
     changed = (np.abs(fitted.level - 1) > SAME_LEVEL) | ~solution.plain
@@ -294,12 +293,6 @@ def _worth(fitted: _Round, returns: int = MOST_RETURNS, changed: BoolArray | boo
     judged = judge(fitted)
     judged.put(rows, anew)
     return judged
-
-
-def _may_return(fit: Solution) -> BoolArray:
-    """(batch,) whether a fit ended where another one may begin."""
-    finite = np.isfinite(fit.theta).all(axis=tuple(range(1, fit.theta.ndim)))
-    return np.asarray(fit.converged & finite)
 
 
 def _alone(fitted: _Round) -> Judged:
@@ -313,9 +306,9 @@ def _alone(fitted: _Round) -> Judged:
     )
     residual = solution.residual[:, 0] * (1 / np.sqrt(scale))[:, None]
     suspect = are_smooth(residual, plan.structure.parameters) | suspect
-    asked = _may_return(solution)
+    asked = solution.converged
     if batch > 1:
-        asked &= suspect | asks(plan, cost, expected, residual)
+        asked = asked & (suspect | asks(plan, cost, expected, residual))
     lack = Lack.of(plan, data, solution, asked)
     suspect = suspect | np.isfinite(lack.found[:, 0])
     doubted = suspect | (lack.chi_square > 0)
@@ -375,7 +368,7 @@ def noise_of_moving_modes(
     """
     plain = BinData.of(y[None, None], u[None, None], plan.order, plan.others_at.size)
     fitted = _Round.weighted_with_noise(plan, plain, theta[None, None])
-    if fitted.kind[0] > 0 or not _may_return(fitted.solution)[0]:
+    if fitted.kind[0] > 0 or not fitted.solution.converged[0]:
         return 1.0
     scale, *_ = level_of(plan, fitted.solution, fitted.noise, np.zeros(1, bool))
     return float(noise_at_modes(plan, fitted.data, fitted.solution, scale)[0])
@@ -446,7 +439,7 @@ def _judged(fitted: _Round, first: _Round) -> Judged:
     # of exact data; what a wrong model leaves differs, too: each transient takes up another part of it
     noisy = fitted.more_than_rounding(levels.excited)
     suspect = (are_smooth(common, plan.structure.parameters) | levels.contradicts) & noisy
-    asked = _may_return(solution) & (suspect | (batch == 1)) & (fitted.kind < 2)
+    asked = solution.converged & (suspect | (batch == 1)) & (fitted.kind < 2)
     lack = Lack.of(plan, fitted.data, solution, asked & noisy)
     suspect |= np.isfinite(lack.found[:, 0])
     covariance, total = fitted.covariances(suspect)

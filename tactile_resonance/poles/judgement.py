@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, TypeVar
 
@@ -101,7 +101,7 @@ class Judged:
     def of(cls, plan: FitPlan, lines: IntArray, **values: Any) -> Judged:
         """With a known level of noise, and nothing found or to remark, of what no value is given for."""
         batch, parameters, places = lines.size, plan.structure.parameters, plan.structure.order // 2
-        nothing: dict[str, tuple[tuple[int, ...], complex]] = {
+        nothing: dict[str, tuple[Any, ...]] = {  # shape, value, kind
             "theta": ((batch, parameters), np.nan),
             "condition_number": ((batch,), np.nan),
             "converged": ((batch,), False),
@@ -115,12 +115,12 @@ class Judged:
             "noise_variance": ((batch, 2), np.nan),
             "systematic": ((batch, places, 2, 2), 0.0),
             "lacking": ((batch, 3), np.nan),
+            "doubt": ((batch,), None, object),
+            "remark": ((batch,), "", object),
         }
         for name in nothing.keys() - values.keys():
             values[name] = np.full(*nothing[name])
         values.setdefault("total", None)
-        values.setdefault("doubt", np.full(batch, None, object))
-        values.setdefault("remark", np.full(batch, "", object))
         return cls(lines=lines, **values)
 
     def put(self, rows: IntArray, others: Judged) -> None:
@@ -132,7 +132,7 @@ class Judged:
     def total_with_model_error(self) -> tuple[IntArray, FloatArray]:
         """Points of which more than noise is known, and their total covariances, with the model error."""
         if self.total is None:
-            rows = np.flatnonzero(self.suspect)
+            rows = self.suspect.nonzero()[0]
             total = self.covariance[rows]
         else:
             rows, total = np.arange(self.lines.size), self.total
@@ -178,13 +178,13 @@ def assemble(
         covariance = covariance.copy()
         covariance[hopeless] = np.nan
     quantities, sensitivity = pole_quantities(model, band_hz, covariance)
-    quantities["total_covariance"] = np.full_like(quantities["covariance"], np.nan)
+    quantities["total_covariance"] = np.full(quantities["covariance"].shape, np.nan)
     rows, total = judged.total_with_model_error()
     if rows.size:
         in_f0 = propagated(quantities["poles_rad_s"][rows], sensitivity[rows], total)[1]
         in_f0[hopeless[rows]] = np.nan
         quantities["total_covariance"][rows] = in_f0 + judged.systematic[rows]
-    lost = judged.level_known & ~hopeless & _lost_to_rounding(quantities["covariance"])
+    lost = judged.level_known & ~hopeless & _lost_to_rounding(quantities["covariance"]).any(axis=-1)
     if lost.any():
         conditioned &= ~lost
         undetermined |= lost
@@ -223,38 +223,29 @@ def assemble(
     for k, note in (item for of_points in notes for item in of_points.items()):
         remark[k] = "; ".join(filter(None, [remark[k], note]))
     code = np.full(hopeless.shape, STATUS_CODE[PolesStatus.OK], np.uint8)
-    with np.errstate(invalid="ignore"):
-        # the gravest last, so that it stays
-        for where, status in (
-            (~judged.level_known, PolesStatus.NO_COVARIANCE),
-            (~np.isfinite(covariance[:, 0, 0]), PolesStatus.NO_COVARIANCE),
-            (judged.suspect, PolesStatus.MODEL_ERROR),
-            ((significant & (poles.real >= 0)).any(axis=-1), PolesStatus.UNSTABLE_POLE),
-            (~significant.any(axis=-1), PolesStatus.NO_RESONANCE),
-            (~conditioned, PolesStatus.ILL_CONDITIONED),
-            (~judged.converged, PolesStatus.NOT_CONVERGED),
-            (~enough, PolesStatus.TOO_FEW_LINES),
-        ):
-            code[where] = STATUS_CODE[status]
+    # the gravest last, so that it stays
+    for where, status in (
+        (~(judged.level_known & np.isfinite(covariance[:, 0, 0])), PolesStatus.NO_COVARIANCE),
+        (judged.suspect, PolesStatus.MODEL_ERROR),
+        ((significant & (poles.real >= 0)).any(axis=-1), PolesStatus.UNSTABLE_POLE),
+        (~significant.any(axis=-1), PolesStatus.NO_RESONANCE),
+        (~conditioned, PolesStatus.ILL_CONDITIONED),
+        (~judged.converged, PolesStatus.NOT_CONVERGED),
+        (~enough, PolesStatus.TOO_FEW_LINES),
+    ):
+        code[where] = STATUS_CODE[status]
 
     def batch(array: npt.NDArray) -> npt.NDArray:
         # of one point an index takes half the time of a new shape
         return array.reshape((*shape, *array.shape[1:])) if shape else array[0, ...]
 
-    delay = model.delay_s
     return PolesBatch(
         **{name: batch(values) for name, values in quantities.items()},
         coefficient_covariance=batch(covariance),
         **{name: batch(getattr(judged, name)) for name in AS_JUDGED},
         significant=batch(significant),
         status_code=batch(code),
-        fit=replace(
-            model,
-            denominator=batch(model.denominator),
-            numerator=batch(model.numerator),
-            transient=batch(model.transient),
-            delay_s=batch(np.asarray(delay)) if np.ndim(delay) else delay,
-        ),
+        fit=plan.model_of(batch(judged.theta)),
         structure=structure,
         band_hz=band_hz,
         variance_model=batch(NAMES[judged.kind]),
@@ -264,11 +255,11 @@ def assemble(
 
 
 def _lost_to_rounding(covariance: FloatArray) -> BoolArray:
-    """(batch,) where a variance of a mode's covariance (batch, k, 2, 2) is not above 0.
+    """(batch, k) where a variance of a mode's covariance (batch, k, 2, 2) is not above 0.
 
     A mode beside its own zero leaves the normal matrix all but singular.
     """
-    return np.asarray(((covariance[..., 0, 0] <= 0) | (covariance[..., 1, 1] <= 0)).any(axis=-1))
+    return np.asarray((covariance[..., 0, 0] <= 0) | (covariance[..., 1, 1] <= 0))
 
 
 def _needed(
@@ -294,7 +285,7 @@ def _needed(
 def _without_lost_totals(quantities: dict[str, npt.NDArray], significant: BoolArray) -> dict[int, str]:
     """Total covariances (batch, k, 2, 2) that rounding has made negative become NaN; notes of points."""
     total = quantities["total_covariance"]
-    lost = (np.diagonal(total, axis1=-2, axis2=-1) <= 0).any(axis=-1)
+    lost = _lost_to_rounding(total)
     if not lost.any():
         return {}
     total[lost] = np.nan

@@ -349,11 +349,11 @@ class LinesPlan(FitPlan):
         return np.asarray(2 * np.pi * self.frequency_hz * self.delay_unit_s)
 
     def model_of(self, theta: FloatArray) -> RationalModel:
-        """The model of coefficients (batch, n)."""
+        """The model of coefficients (..., n)."""
         if not self.structure.delay:
             return super().model_of(theta)
         unit_s = self.delay_unit_s
-        return replace(super().model_of(theta[:, :-1]), delay_s=theta[:, -1] * unit_s, delay_unit_s=unit_s)
+        return replace(super().model_of(theta[..., :-1]), delay_s=theta[..., -1] * unit_s, delay_unit_s=unit_s)
 
     @property
     def _one_by_one(self) -> bool:

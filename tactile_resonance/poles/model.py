@@ -160,15 +160,19 @@ class Variable:
             return np.asarray(np.exp(s_rad_s / self.sample_rate_hz))
         return s_rad_s / self.scale_rad_s
 
-    def to_s(self, x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """The s [rad/s] of x, and the derivative ds/dx."""
+    def to_s(self, x: ComplexArray) -> ComplexArray:
+        """The s [rad/s] of x."""
         if self.sample_rate_hz is not None and self.domain == "z":
             with np.errstate(divide="ignore", invalid="ignore"):
-                s = np.asarray(self.sample_rate_hz * np.log(x), complex)
-                return s, self.sample_rate_hz / x
-        return np.asarray(x * self.scale_rad_s, complex), np.full(
-            np.shape(x), self.scale_rad_s, complex
-        )
+                return np.asarray(self.sample_rate_hz * np.log(x), complex)
+        return np.asarray(x * self.scale_rad_s, complex)
+
+    def slope(self, x: ComplexArray) -> ComplexArray:
+        """The derivative ds/dx [rad/s]."""
+        if self.sample_rate_hz is not None and self.domain == "z":
+            with np.errstate(divide="ignore", invalid="ignore"):
+                return np.asarray(self.sample_rate_hz / x)
+        return np.full(x.shape, self.scale_rad_s, complex)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,14 +217,14 @@ class RationalModel:
 
     def poles_rad_s(self) -> ComplexArray:
         """(..., n) all poles [rad/s]."""
-        return self.variable.to_s(self.denominator_basis.roots(self.denominator))[0]
+        return self.variable.to_s(self.denominator_basis.roots(self.denominator))
 
     def zeros_rad_s(self) -> ComplexArray:
         """(..., m) all zeros [rad/s]."""
         if self.numerator.shape[-1] < 2:
             return np.empty((*self.numerator.shape[:-1], 0), complex)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self.variable.to_s(self.numerator_basis.roots(self.numerator))[0]
+            return self.variable.to_s(self.numerator_basis.roots(self.numerator))
 
     def response(self, frequency_hz: FloatArray) -> ComplexArray:
         """(..., F) the model at any frequencies (F,)."""
@@ -240,7 +244,7 @@ class RationalModel:
         """
         x = self.variable.of_s(poles_rad_s)
         points = math.prod(x.shape[:-1])
-        arrays = (x, self.variable.to_s(x)[1], self.denominator, self.numerator)
+        arrays = (x, self.variable.slope(x), self.denominator, self.numerator)
         hessenberg = self.denominator_basis.hessenberg, self.numerator_basis.hessenberg
         k, n = x.shape[-1], hessenberg[0].shape[1]
         residues, sensitivity = np.empty((points, k), complex), np.empty((points, k, n), complex)
@@ -260,7 +264,7 @@ class RationalModel:
         """(..., k, m + 1) derivative of simple zeros (..., k) by the coefficients of B."""
         x = self.variable.of_s(zeros_rad_s)
         values, slopes = self.numerator_basis.at(x)
-        factor = -self.variable.to_s(x)[1] / _dot(slopes, self.numerator)
+        factor = -self.variable.slope(x) / _dot(slopes, self.numerator)
         return values * factor[..., None]
 
     def residue_sensitivity(self, poles_rad_s: ComplexArray) -> ComplexArray:
@@ -271,7 +275,7 @@ class RationalModel:
         a2 = _dot(bends, self.denominator)
         b_values, b_slopes = self.numerator_basis.at(x)
         b, b1 = _dot(b_values, self.numerator), _dot(b_slopes, self.numerator)
-        map_1 = self.variable.to_s(x)[1]
+        map_1 = self.variable.slope(x)
         map_2 = -map_1 / x if self.variable.domain == "z" else np.zeros_like(map_1)
         dx = -values[..., :-1] / a1[..., None]
         residue = b / a1
@@ -420,19 +424,18 @@ def pole_quantities(
     With a covariance (points, n, n) of the free coefficients, those of the denominator first. And the
     derivatives (points, k, n) of the poles by these.
     """
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        poles = modes_in_band(model.poles_rad_s(), band_hz)
-        f0_hz, damping_ratio = natural_frequency_and_damping(poles)
-        residues, sensitivity = model.residues_and_sensitivity(poles)
-        of_poles, in_f0 = propagated(poles, sensitivity, parameters)
-        quantities = {
-            "poles_rad_s": poles,
-            "f0_hz": f0_hz,
-            "damping_ratio": damping_ratio,
-            "residues": residues,
-            "pole_covariance": of_poles,
-            "covariance": in_f0,
-        }
+    poles = modes_in_band(model.poles_rad_s(), band_hz)
+    f0_hz, damping_ratio = natural_frequency_and_damping(poles)
+    residues, sensitivity = model.residues_and_sensitivity(poles)
+    of_poles, in_f0 = propagated(poles, sensitivity, parameters)
+    quantities = {
+        "poles_rad_s": poles,
+        "f0_hz": f0_hz,
+        "damping_ratio": damping_ratio,
+        "residues": residues,
+        "pole_covariance": of_poles,
+        "covariance": in_f0,
+    }
     return quantities, sensitivity
 
 

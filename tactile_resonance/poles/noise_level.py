@@ -152,8 +152,9 @@ def chance_of_level(ratio: FloatArray, dof: FloatArray, of_level: FloatArray) ->
 
     1 up to a deviation above 1, which noise exceeds more often than any test asks for.
     """
-    chance, rare = np.ones(ratio.shape), ~(ratio <= 1 + np.sqrt(1 / dof + 1 / of_level))
-    chance[rare] = special.fdtrc(2 * dof[rare], 2 * of_level[rare], ratio[rare])
+    chance, rare = np.ones(ratio.shape), (~(ratio <= 1 + np.sqrt(1 / dof + 1 / of_level))).nonzero()[0]
+    if rare.size:
+        chance[rare] = special.fdtrc(2 * dof[rare], 2 * of_level[rare], ratio[rare])
     return chance
 
 

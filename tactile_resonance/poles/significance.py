@@ -177,7 +177,7 @@ def significant_modes(
     if modes == 1:
         variance = quantities["covariance"][..., 1, 1]
         tested &= ~(variance < (CERTAIN * quantities["damping_ratio"]) ** 2)
-    rows = np.flatnonzero(tested.any(axis=-1))
+    rows = tested.any(axis=-1).nonzero()[0]
     if rows.size == 0:
         return found, distances
     with np.errstate(all="ignore"):

@@ -234,9 +234,10 @@ class Problem:
     def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients of A (with its last), B and C, each (..., terms), of theta (..., n)."""
         a, b, _ = self.sizes
-        one = np.ones((*theta.shape[:-1], 1))
+        alpha = np.empty((*theta.shape[:-1], a + 1))
+        alpha[..., :a], alpha[..., a] = theta[..., :a], 1.0
         return (
-            np.concatenate([theta[..., :a], one], axis=-1),
+            alpha,
             np.ascontiguousarray(theta[..., a : a + b]),
             np.ascontiguousarray(theta[..., a + b :]),
         )
@@ -328,14 +329,14 @@ class FitPlan(ABC):
         return self.with_structure(replace(of, order=order, numerator_order=numerator_order))
 
     def model_of(self, theta: FloatArray) -> RationalModel:
-        """The model of coefficients (batch, n)."""
+        """The model of coefficients (..., n)."""
         coefficients, bases = self.problem.split(theta), (self.denominator_basis, self.numerator_basis)
         return RationalModel(*coefficients, self.variable, *bases)
 
     def poles_in_band(self, theta: FloatArray) -> ComplexArray:
         """(batch, places) poles [rad/s] of coefficients (batch, n)."""
         roots = self.denominator_basis.roots(self.problem.split(theta)[0])
-        return modes_in_band(self.variable.to_s(roots)[0], self.band_hz)
+        return modes_in_band(self.variable.to_s(roots), self.band_hz)
 
     def compared(self, data: BinData, start: FloatArray | None = None) -> ComplexArray:
         """Poles (points, places) of a fit of few iterations that others are compared with."""
