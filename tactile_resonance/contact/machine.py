@@ -66,6 +66,9 @@ what a robot's watchdog of 25 Hz allows, since in simulated time it is fed once 
 CALM = 2.5
 """Deviations by which the force of a held contact that is calm is off at most, as a mean of some forces."""
 
+FRESH_PERIODS = 3
+"""In a calm contact the newest force and state of the arm are younger."""
+
 WISH_NS = 1_000_000_000
 """For so long a retraction that is asked for waits for an arm that cannot move [ns]."""
 
@@ -291,8 +294,11 @@ class ContactController:
         limit = self.parameters.acceleration_m_s2
         if self.state in RELIEVING and speed > arm_model.set_speed_m_s:
             limit = max(limit, self.parameters.relief_acceleration_m_s2)
-        if self._calm_periods > 1 and self._is_calm():
-            self._stride = self._calm_periods
+        if self._calm_periods > 1 and wrenches and self._is_calm():
+            # where a device may be silent each period looks for it
+            age_s = (now_ns - min(arm.time_ns, wrenches[-1].time_ns)) * 1e-9
+            if age_s < FRESH_PERIODS * self.parameters.period_s:
+                self._stride = self._calm_periods
         for _ in range(self._stride):
             arm_model.step(speed, limit)
         return Command(twist, limit)

@@ -25,8 +25,8 @@ HUNG_S = 1.0
 END_WITHIN_S = 3.0
 # Between two attempts to start a force source that has failed, by the loop's clock.
 SOURCE_AGAIN_NS = 250_000_000
-# A contact that is held and calm is looked at in one of so many periods.
-CALM_PERIODS = 2
+# A contact that is held and calm is looked at in one of so many periods: 8 ms, less than forces may be old.
+CALM_PERIODS = 4
 # While nothing is under way the loop runs as often as is published, at least once in so many periods: 40 ms.
 MOST_IDLE_PERIODS = 20
 

@@ -68,6 +68,7 @@ def contact(
     seed=0,
     tip=None,
     under_sample=False,
+    calm_periods=1,
     **bench,
 ):
     touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
@@ -81,7 +82,9 @@ def contact(
         **bench,
     )
     limits = Limits() if limits is None else limits
-    controller = ContactController(parameters, limits, under_sample=under_sample)
+    controller = ContactController(
+        parameters, limits, under_sample=under_sample, calm_periods=calm_periods
+    )
     loop = ContactLoop(rig.arm, rig.cell, rig.clock, controller)
     goal = ContactGoal(touch, Aim(FORCE_N) if aim is None else aim)
     return Contact(rig, controller, loop, goal)
