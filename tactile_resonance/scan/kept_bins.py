@@ -27,6 +27,7 @@ from typing import IO
 import numpy as np
 import numpy.typing as npt
 
+from tactile_resonance.fields import read
 from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import BandBins, band_bins
 from tactile_resonance.frf.spectra import Spectrum
@@ -136,9 +137,7 @@ def kept_bins(run: Path, band_hz: tuple[float, float]) -> KeptBins | None:
         low_hz, high_hz = content["band_hz"]
         if content["format"] != FORMAT or content["files"] != files:
             return None
-        kinds = [
-            BinsKind(**{**kind, "harmonics": tuple(kind["harmonics"])}) for kind in content["kinds"]
-        ]
+        kinds = read(tuple[BinsKind, ...], content["kinds"], "kinds")
         pieces = [
             Piece(kind, path, f"points_{k}_{j}", count, kinds_crc)
             for k, (kind, counts) in enumerate(zip(kinds, content["counts"], strict=True))
