@@ -143,10 +143,12 @@ def frf_of_realisations(spectra: PeriodicSpectra, *, sample_rate_hz: float) -> F
     g = g_each.mean(axis=-2)
     variance_total = np.var(g_each, axis=-2, ddof=1) / realisations if several else None
     variance_noise = given = differ = None
-    weight = _of_level(input_power)
+    weight = _of_level(input_power) if several else np.ones(1)
     if spectra.covariance is not None:
-        given = conditional_variance(spectra.covariance.mean(axis=-4) / realisations)
-        noise = (spectra.covariance * weight[:, None, None, None]).mean(axis=-4) / realisations
+        noise = spectra.covariance.mean(axis=-4) / realisations
+        given = conditional_variance(noise)
+        if several:
+            noise = (spectra.covariance * weight[:, None, None, None]).mean(axis=-4) / realisations
         variance_noise = error_variance(g, noise) / (input_power * weight[:, None]).mean(axis=-2)
         if variance_total is not None:
             with np.errstate(divide="ignore", invalid="ignore"):

@@ -189,7 +189,7 @@ class MeasurementFrf:
 
     def _take(self, record: Spectrum, realisation: int, excitation: Excitation) -> None:
         """Periods (P, N) that follow those of the same realisation without a gap."""
-        if not np.all(np.isfinite(record.samples)):
+        if not np.all(np.isfinite(record.bins[..., 0])):
             raise ValueError("record: samples are not finite, expected a complete block")
         so_far = self._periods[realisation]
         periods = so_far + record.periods

@@ -99,11 +99,11 @@ class PolesNode(ManagedNode):
                 self._publisher.publish(poles_to_message(poles, origin_from_message(of)))
 
     def _answer(self, message: msg.FRF) -> None:
-        origin = origin_from_message(message)
         try:
-            frf, _ = frf_from_message(message)
+            frf, origin = frf_from_message(message)
             poles = self._identify(frf, origin.contact)
         except Exception as error:  # a reader waits for an answer to every FRF
+            origin = origin_from_message(message)
             reason = self.health.failed(f"FRF of measurement {origin.measurement_id}", error)
             poles = Poles(status=PolesStatus.FAILED, message=reason)
         self._publisher.publish(poles_to_message(poles, origin))
