@@ -42,7 +42,8 @@ path, target, *wanted = sys.argv[1:]
 names = [name for name, *_ in scipy.io.whosmat(path)]
 held = [name for name in names if name in wanted]
 content = scipy.io.loadmat(path, variable_names=held) if held else {}
-arrays = {f"a{names.index(n)}": content[n] for n in held if content[n].dtype.kind in "biufc"}
+held = [n for n in held if isinstance(content[n], np.ndarray) and content[n].dtype.kind in "biufc"]
+arrays = {f"a{names.index(n)}": content[n] for n in held}
 np.savez(target, names=np.array(names or [""]), **arrays)
 """
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -44,6 +45,13 @@ def test_what_is_not_wanted_is_neither_read_nor_in_the_way(tmp_path):
         assert set(names) == {"u", "text", "o"}
         np.testing.assert_array_equal(np.ravel(arrays["u"]), np.arange(3))
         assert read_arrays(tmp_path / name, ("text",))[0] == {}  # no numbers
+
+
+def test_a_sparse_matrix_counts_as_no_numbers(tmp_path):
+    """NumPy's files hold none: it would be kept as an object, and refused without the name of the file."""
+    scipy.io.savemat(tmp_path / "a.mat", {"u": scipy.sparse.csc_matrix(np.eye(3)), "y": np.arange(3)})
+    arrays, names = read_arrays(tmp_path / "a.mat", NAMES)
+    assert (set(arrays), set(names)) == ({"y"}, {"u", "y"})
 
 
 @pytest.mark.parametrize("size", [1 << 27, 1 << 40])

@@ -262,7 +262,7 @@ def _period_length(
     if cut_in_periods and shape[-1] != samples_per_period:
         raise ValueError(
             f"samples_per_period: {samples_per_period}, but {name} has shape {shape}: expected "
-            f"{shape[-1]}"
+            f"{shape[-1]}, or the samples of a period along the last axis"
         )
     if shape[-1] % samples_per_period:
         raise ValueError(
