@@ -203,10 +203,6 @@ def run_job(job: Job) -> int:
 
     begun_s = time.monotonic()
     # what cannot be scanned is reported before anything is started
-    content = read_scan_scene(job.scene)
-    make_plan(content)
-    touched = read_phantoms(job.scene) is not None
-    require(touched, f"{job.scene.name}: regions", None, "what the simulated bench touches")
     if not job.resume:
         RunDirectory.check_new(job.output, 0)
     else:
@@ -220,6 +216,10 @@ def run_job(job: Job) -> int:
         given, began = job.calibration is not None, is_calibrated(so_far)
         accepted = "the file with which the run began" if began else "none: the run began without"
         require(began in (None, given), "--calibration", str(job.calibration or "none"), accepted)
+    content = read_scan_scene(job.scene)
+    make_plan(content)
+    touched = read_phantoms(job.scene) is not None
+    require(touched, f"{job.scene.name}: regions", None, "what the simulated bench touches")
     job = replace(job, host=take_domain(job.host))
     require_own_domain()
     print(

@@ -175,3 +175,19 @@ def test_bad_options_are_refused_in_one_line(capsys):
         assert printed.err.count("\n") == 1
     assert cli.main(["resume", "nowhere"]) == 1
     assert "nowhere'; accepted is the folder of a run, to resume it" in capsys.readouterr().err
+
+
+def test_a_run_whose_scene_was_cut_short_is_told_so(tmp_path, capsys):
+    """What is left may be no scene, which says nothing of its cause."""
+    from tactile_resonance import cli
+    from tactile_resonance.scan.points import ScanPoint
+    from tactile_resonance.scan.run_directory import RunDirectory
+
+    point = ScanPoint(0, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), "point 1")
+    scene = "force_n: 0.01\npositions: {adaptive: {map: {}}}\n"
+    with RunDirectory.create(tmp_path / "run", scene, [point], {}):
+        pass
+    (tmp_path / "run" / "scene.yaml").write_text(scene[:-9])
+    assert cli.main(["resume", str(tmp_path / "run")]) == 1
+    told = capsys.readouterr().err
+    assert f"scene.yaml: has {len(scene) - 9} bytes, {len(scene)} when it was finished" in told
