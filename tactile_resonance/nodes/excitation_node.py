@@ -25,7 +25,7 @@ from tactile_resonance.nodes.messages import (
     NO_RECORDS,
     excitation_to_message,
     record_to_message,
-    write_record_origin,
+    write_record_contact,
 )
 from tactile_resonance.nodes.parameters import Fixed, Parameter, values
 from tactile_resonance.nodes.running import EXCITATIONS, POINT_RESULTS, RESULTS
@@ -313,7 +313,7 @@ class ExcitationNode(ManagedNode):
     def _origin(record: Record, contact: Callable[[], Contact], message: msg.Record) -> Origin:
         """The origin of a record with its contact, also in its message."""
         origin = replace(record.origin, contact=contact())
-        write_record_origin(message, origin)
+        write_record_contact(message, origin.contact)
         return origin
 
     def _record(self, block: Record, excitation: Excitation, info: DeviceInfo) -> Record:

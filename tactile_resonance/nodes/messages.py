@@ -64,6 +64,7 @@ FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in Fr
 FRF_EQUAL = plain(FRF)
 FRF_OPTIONAL = tuple(name for name in PER_LINE if name not in ("frequency_hz", "g"))
 
+_OF_RECORD_CONTACT = ("coverage", "reason")  # fields of a contact that records alone have
 UNKNOWN_SPREAD = ForceSpread()
 CONTACT_FIGURES = (
     *("force_n", "force_std_n", "depth_m", "stiffness_n_per_m", "surface_m", "surface_std_m"),
@@ -109,13 +110,14 @@ def record_to_message(record: Record) -> msg.Record:
             write_values(message, ("scale_v", "offset_v"), channel, f"{name}_")
         else:
             fill(getattr(message, f"{name}_v"), channel.samples)
-    return write_record_origin(message, record.origin)
+    _write_origin(message, record.origin)
+    return write_values(message, _OF_RECORD_CONTACT, record.origin.contact, "contact_")
 
 
-def write_record_origin(message: msg.Record, origin: Origin) -> msg.Record:
-    """Write what a record belongs to, with the contact over it; return the message."""
-    _write_origin(message, origin)
-    return write_values(message, ("coverage", "reason"), origin.contact, "contact_")
+def write_record_contact(message: msg.Record, contact: Contact) -> None:
+    """Write the contact over a record into its message, which has none yet."""
+    _write_contact(message, contact)
+    write_values(message, _OF_RECORD_CONTACT, contact, "contact_")
 
 
 def poles_to_message(poles: Poles, origin: Origin) -> msg.Poles:
@@ -137,10 +139,13 @@ def _write_band(message: Any, poles: Poles) -> Any:
 
 def _write_origin(message: msg.Record | msg.FRF | msg.Poles, origin: Origin) -> None:
     """What a record, FRF or poles belong to."""
-    contact = origin.contact
     write_header(message.header, origin.time_ns, origin.frame_id)
-    message.tip_pose = pose_to_message(contact)
     write_values(message, ORIGIN, origin)
+    _write_contact(message, origin.contact)
+
+
+def _write_contact(message: msg.Record | msg.FRF | msg.Poles, contact: Contact) -> None:
+    _write_pose(message.tip_pose, contact)
     write_values(message, ("force_n", "force_std_n"), contact, "contact_")
     write_values(message, SPREAD, contact.spread, "contact_force_")
 
@@ -152,7 +157,10 @@ def time_message(time_ns: int) -> Time:
 
 def pose_to_message(contact: Contact) -> PoseStamped:
     """Tip pose; an empty frame where the position is unknown."""
-    message = PoseStamped()
+    return _write_pose(PoseStamped(), contact)
+
+
+def _write_pose(message: PoseStamped, contact: Contact) -> PoseStamped:
     if contact.position_m is None:
         return message
     write_header(message.header, contact.time_ns, contact.frame_id)
