@@ -17,7 +17,7 @@ import numpy as np
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.estimate import disagreement
 from tactile_resonance.poles.data import BinData, rules_between, with_noise
-from tactile_resonance.poles.fit import minimise, refit_failed
+from tactile_resonance.poles.fit import SEVERAL_MODES, best_of_split, minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
 from tactile_resonance.poles.levels import Levels, Spread
@@ -35,7 +35,6 @@ from tactile_resonance.poles.noise_level import (
     student_variance,
 )
 from tactile_resonance.poles.significance import are_smooth, systematic_of
-from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
 
 if TYPE_CHECKING:
     from tactile_resonance.poles.joint import JointPlan

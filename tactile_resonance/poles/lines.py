@@ -21,14 +21,15 @@ from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.data import BinData
 from tactile_resonance.poles.fit import (
     Linearised,
+    exchanged,
     least_squares,
     linear_step,
     minimise,
+    moved_to,
 )
 from tactile_resonance.poles.likelihood import Rules, Solution
 from tactile_resonance.poles.model import RationalModel, real_rows
 from tactile_resonance.poles.noise_level import FALSE_ALARM, VarianceModel, at_modes, model_variance
-from tactile_resonance.poles.starts import exchanged, moved_to
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import FitPlan, Problem
 

@@ -17,7 +17,7 @@ import numpy as np
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.compiled import compiled
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.fit import minimise
+from tactile_resonance.poles.fit import SEVERAL_MODES, best_of_split, minimise
 from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.likelihood import (
     BLOCK,
@@ -38,7 +38,6 @@ from tactile_resonance.poles.likelihood import (
     Solution,
 )
 from tactile_resonance.poles.model import PolynomialBasis, RationalModel, Variable, modes_in_band
-from tactile_resonance.poles.starts import SEVERAL_MODES, best_of_split
 from tactile_resonance.poles.structure import ModelStructure
 
 if TYPE_CHECKING:
