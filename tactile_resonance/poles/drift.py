@@ -364,8 +364,8 @@ def poles_with_drift(
     -------
     Drifted or None
         None where nothing changes beyond chance. Status MODEL_ERROR where something changes that is no drift of
-        the poles: the gain too, as where contact is lost, or no fit with drift is found; then `rest` is y. So it
-        is where errors of one moment pass for a change or, near either end of the record, for a transient.
+        the poles: the gain too, as where contact is lost, or no fit with drift is found; then `rest` is y. The
+        same where errors of one moment pass for a change or, near either end of the record, for a transient.
     """
     modes, found = DriftingModes(plan, fit, u), None
     with np.errstate(all="ignore"):
