@@ -167,6 +167,8 @@ def _mean_of(power: FloatArray, plan: JointPlan) -> FloatArray:
     Of records that are not equally noisy the plain mean would be that of the noisiest alone, which exceeds its
     surroundings more often than a mean of M does.
     """
+    if len(power) == 1:
+        return power[0]
     at = plan.others_at if plan.others_at.size else plan.order
     level = np.median(power[:, at], axis=1)
     if not level.all():  # an exact input
