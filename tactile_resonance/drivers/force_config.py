@@ -192,11 +192,16 @@ def read_force_config(path: Path, force_n: float | None = None) -> ForceConfig:
     known = type(kind) is str and kind in _KINDS
     require(known, f"{where} kind", kind, f"one of {', '.join(_KINDS)}")
     given: dict[str, Any] = {}
-    if not content.get("name", ""):
+    if content.get("name", "") == "":
         content["name"] = kind
     if kind == "can":
-        counts = content.get("counts_per_n")  # with a matrix the step depends on the direction
-        if content.get("resolution_n") is None and type(counts) in (int, float) and counts > 0:
+        counts = content.get("counts_per_n")
+        # with a matrix the step depends on the direction
+        alone = counts is not None or content.get("matrix") is None
+        if alone and content.get("resolution_n") is None:
+            good = type(counts) in (int, float) and 0 < counts < math.inf
+            accepted = "a number above 0, or a matrix in place of both"
+            require(good, f"{where} counts_per_n", counts, accepted)
             content["resolution_n"] = 1 / counts
         frames = read_file_name(content.get("frames"), f"{where} frames")
         beside = path.parent / frames

@@ -62,6 +62,10 @@ BLIND = [[0.0] * 5 + [1e-3]] * 2 + [[float(i == j) for j in range(6)] for i in r
     [
         ({"kind": "usb"}, "kind: got 'usb'; accepted is one of can, rtde, topic"),
         ({"kind": ["can"]}, r"kind: got \['can'\]; accepted is one of can, rtde, topic"),
+        ({"name": 0}, "name: got 0; accepted is text"),
+        ({"counts_per_n": "5000"}, "counts_per_n: got '5000'; accepted is a number above 0"),
+        ({"counts_per_n": -5}, "counts_per_n: got -5; accepted is a number above 0"),
+        ({"counts_per_n": None}, "counts_per_n: got None; .*or a matrix in place of both"),
         ({"rate_hz": 999}, "rate_hz: got 999.0; accepted is one of"),
         ({"rate_hz": "fast"}, "rate_hz: got 'fast'"),
         ({"noise_rms_n": -1}, "noise_rms_n: got -1.0"),
