@@ -67,7 +67,7 @@ CALM = 2.5
 """Deviations by which the force of a held contact that is calm is off at most, as a mean of some forces."""
 
 FRESH_PERIODS = 3
-"""In a calm contact the newest force and state of the arm are younger."""
+"""A contact is not calm where the newest force or state of the arm is as many periods old: it may be silent."""
 
 WISH_NS = 1_000_000_000
 """For so long a retraction that is asked for waits for an arm that cannot move [ns]."""

@@ -90,7 +90,7 @@ def test_tissue_that_jolts_presses_no_harder(held, name, speed_m_s, way_m, late_
     assert most_n[1] < most_n[0] + 0.03 * FORCE_N
 
 
-def age_at_fault_s(each, begin, causes):
+def found_after_s(each, begin, causes):
     """From when a fault begins until the contact is given up for it."""
     begin(each)
     began_ns = each.bench.clock.now_ns()
@@ -114,6 +114,5 @@ def test_a_device_that_is_silent_is_found_as_soon(held, begin, causes, late_peri
     for periods in (1, PERIODS):
         each = held("soft", periods)
         each.bench.clock.wait_until(each.bench.clock.now_ns() + 2_000_000 * late_periods)
-        ages_s.append(age_at_fault_s(each, begin, causes))
-    print(ages_s)
+        ages_s.append(found_after_s(each, begin, causes))
     assert ages_s[1] < ages_s[0] + 1.5 * 0.002
