@@ -10,6 +10,7 @@ import threading
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
@@ -26,7 +27,7 @@ from tactile_resonance.srv import ForceOver
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.force_spread import ForceSpread
-from tactile_resonance.drivers.acquisition import DeviceError
+from tactile_resonance.drivers.acquisition import DeviceError, DeviceInfo
 from tactile_resonance.nodes import devices, excitation_node
 from tactile_resonance.nodes.devices import FORCE_WITHIN_S
 from tactile_resonance.nodes.excitation_node import ExcitationNode
@@ -35,8 +36,9 @@ from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.parameters import declare
 from tactile_resonance.nodes.running import PLACES, initialised
 from tactile_resonance.processes import free_domain_id
-from tactile_resonance.record import Contact
-from tactile_resonance.recording.messages import time_from_message
+from tactile_resonance.record import Channel, Contact, Origin, Record
+from tactile_resonance.recording.messages import record_from_message, time_from_message
+from tactile_resonance.recording.store import read_stored
 
 
 @pytest.fixture
@@ -121,6 +123,71 @@ def test_what_an_error_means_is_a_matter_of_how_far_the_measurement_came(
     assert result.outcome == outcome
     expected = f"device: cannot {raises}" if raises else "level_v: peak"
     assert result.message.startswith(expected)
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        Contact(0.01, 2e-5, (0.1, 0.0, 0.3), frame_id="base", spread=ForceSpread(1e-4, 9e-3, 0.011)),
+        Contact(reason="no answer on force_over within 1 s"),
+    ],
+    ids=["told", "not told"],
+)
+def test_a_record_is_kept_and_handed_out_with_what_is_told_of_its_contact(monkeypatch, tmp_path, told):
+    """Asked over the samples of this block; also where nobody answers no record is lost."""
+    asked, published = [], []
+
+    class Device:
+        excitation = None
+
+        def plan(self, excitations):
+            return excitations
+
+        def configure(self, rate_hz):
+            return DeviceInfo("a device", math.inf)
+
+        def play(self, excitation):
+            self.excitation = excitation
+
+        def read_block(self, timeout_s):
+            volts = Channel(np.sin(np.arange(self.excitation.samples_per_period)))
+            rate_hz, size = self.excitation.sample_rate_hz, self.excitation.samples_per_period
+            return Record(volts, volts, rate_hz, size, origin=Origin(time_ns=START_NS))
+
+        def stop(self):
+            pass
+
+        close = stop
+
+    def ask(start_ns, end_ns):
+        asked.append((start_ns, end_ns))
+        return lambda: told
+
+    monkeypatch.setattr(devices, "make_device", lambda _: (Device(), ()))
+    given = ["--ros-args", "-p", f"record_folder:={tmp_path}"]
+    with initialised(args=given, domain_id=free_domain_id(os.environ)):
+        node = ExcitationNode()
+        node.trigger_configure()
+        node.trigger_activate()
+        node._contact = SimpleNamespace(ask=ask)
+        monkeypatch.setattr(node._records, "publish", published.append)
+        goal = SimpleNamespace(
+            request=Measure.Goal(level_v=0.1, periods=1, realisations=1),
+            publish_feedback=lambda _: None,
+            is_cancel_requested=False,
+        )
+        result = node._measure(goal, node._device)
+        node.destroy_node()
+    assert (result.message, result.blocks) == ("", 1)
+    (file,) = tmp_path.rglob("record-*.npz")
+    kept, (message,) = read_stored(file, Record), published
+    block_ns = round(kept.samples_per_period / kept.sample_rate_hz * 1e9)
+    assert asked == [(START_NS, START_NS + block_ns)]
+    for record in (kept, record_from_message(message)):
+        # NaN is not equal to itself
+        assert repr(record.origin.contact) == repr(told)
+        assert record.origin.time_ns == START_NS
+        assert np.array_equal(record.sensor.samples, np.sin(np.arange(kept.samples_per_period)))
 
 
 def test_a_measurement_of_a_former_configuration_leaves_the_present_one_alone(monkeypatch, tmp_path):
