@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
             require(value == option.default, name, value, "none beside a run, which knows it")
     found = {path: list(_tests(path, options)) for path in options.paths}
     tests = [one for of_path in found.values() for one in of_path]
-    require(bool(tests), str(options.paths[0]), None, "a mechanical test; scenes ask by protocols")
+    require(bool(tests), str(options.paths[0]), None, "mechanical tests, which `protocols` of a scene asks for")
     for path, of_path in found.items():
         for one in of_path:
             print("\n".join(_lines(one)))

@@ -215,7 +215,7 @@ def _plan_and_bins(
 
 
 def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
-    """Poles from bins (M, K): by all as excitation, without tones, with drift, as the record asks for."""
+    """Poles from bins (M, K): by all as excitation, with drift, without tones, as the record asks for."""
     if len(u) == 1:
         u, y = u[0], y[0]
     batch = plan.from_bins(u, y)

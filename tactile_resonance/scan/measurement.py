@@ -163,7 +163,7 @@ def design_measurement(scene: ScanScene) -> MeasurementDesign:
     elif samples is None:
         samples, margin = shortest_samples(use.bands, use.sample_rate_hz, share, least_s), 0
     spacing_hz, block_s = use.sample_rate_hz / samples, samples / use.sample_rate_hz
-    accepted = f"{least_s * use.sample_rate_hz:g} or more with a gate, which cannot judge a force of less time"
+    accepted = f"{least_s * use.sample_rate_hz:g} or more with a gate, which must know how the force moved"
     require(block_s >= least_s, "sensor.samples_per_period", samples, accepted)
     blocks = scene.blocks or _default_blocks(scene, block_s)
     narrow = not distortion and Output.FRF not in outputs
@@ -302,7 +302,7 @@ def shortest_samples(
     for band in bands:
         width_hz = band.high_hz - band.low_hz
         least_hz = lines_wanted(band) / share / LONGEST_S
-        accepted = f"{least_hz:.2g} Hz wide or more with samples_per_period auto: of {LONGEST_S:g} s at most"
+        accepted = f"{least_hz:.2g} Hz wide or more with samples_per_period auto, {LONGEST_S:g} s at most"
         require(width_hz >= least_hz, "sensor: band [Hz]", band.ends_hz, accepted)
     fewest = max(
         int((lines_wanted(band) / share - 1) * sample_rate_hz / (band.high_hz - band.low_hz))
