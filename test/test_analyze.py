@@ -185,7 +185,7 @@ BAD = {
         "numerator_order (--numerator-order): got",
     ),
     "output folder": (damaged(), ("--json", "/nonexistent/out.json"), "--json: got '/nonexistent"),
-    "measurement": (damaged(), ("--measurement", 3), "measurement_id (--measurement): 3, only for"),
+    "measurement": (damaged(), ("--measurement", 3), "measurement_id (--measurement): got 3; accepted is none"),
     "period": (
         damaged(),
         ("--samples-per-period", 3),

@@ -76,10 +76,11 @@ class ManagedNode(LifecycleNode):
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
-        super().__init__(name)
+        # first, for an interrupt may have rclpy destroy a node that is not made yet
         self.resources = ExitStack()
         self.active = False
         self._failing = False
+        super().__init__(name)
         for service in self.services:
             if service.srv_type is ChangeState:
                 service.callback = partial(self._change_state, service.callback)

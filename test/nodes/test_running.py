@@ -13,8 +13,10 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 
 import rclpy
+from rclpy.lifecycle.node import LifecycleNodeMixin
 
 from tactile_resonance.nodes import running
+from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.running import END_WITHIN_S, initialised, run_node
 from tactile_resonance.processes import free_domain_id
 
@@ -53,6 +55,16 @@ def test_an_interrupt_that_meets_the_middleware_at_work_is_no_crash(node, monkey
     monkeypatch.setattr(rclpy, "spin", spin)
     run_node(node)
     assert limits == [END_WITHIN_S]
+
+
+def test_an_interrupt_that_meets_a_node_as_it_is_made_is_no_crash(node, monkeypatch, limits):
+    """Within LifecycleNode: rclpy knows the node by then, and destroys it as it shuts down."""
+
+    def begin(*_, **__):
+        raise KeyboardInterrupt  # as the handler does, here before rclpy's own shuts down
+
+    monkeypatch.setattr(LifecycleNodeMixin, "__init__", begin)
+    run_node(lambda: ManagedNode("ending", ()))
 
 
 def test_a_node_that_is_asked_to_end_and_hangs_is_ended(node, monkeypatch, limits):
