@@ -24,7 +24,6 @@ from rclpy.executors import await_or_execute
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.publisher import LifecyclePublisher
 from rclpy.qos import QoSProfile
-from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
@@ -148,7 +147,7 @@ class ManagedNode(LifecycleNode):
         *,
         raw: bool = False,
         always: bool = False,
-    ) -> Subscription:
+    ) -> None:
         """Subscription until the node is cleaned up, heard while active or `always`; serialised if `raw`."""
 
         def heard(message: Any) -> None:
@@ -159,7 +158,6 @@ class ManagedNode(LifecycleNode):
 
         subscription = self.create_subscription(kind, topic, heard, qos, raw=raw)
         self.resources.callback(self.destroy_subscription, subscription)
-        return subscription
 
     def serve(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """Service until the node is cleaned up; the callback sees to `active` itself, and may wait."""

@@ -32,8 +32,8 @@ from tactile_resonance.scan.run_directory import PointRecording
 
 DEVICE_BACK_WITHIN_S = 60.0
 RESULTS_WITHIN_S = 10.0
-"""All results of a measurement come within this after its last block, on the machine's clock; in simulated time
-a slow machine may take as long as a node may be silent."""
+"""After the last block of a measurement each further result of it comes within this, on the machine's clock; in
+simulated time a slow machine may take as long as a node may be silent."""
 NOT_READY_POLL_S = 0.2
 
 
@@ -149,9 +149,11 @@ class MeasureClient:
 
     def _wait_for_results(self, result: Measure.Result, check: Check) -> None:
         """Until every block's record, FRF and poles are in the recording, and all excitations."""
-        deadline = time.monotonic() + self._time.patience_s(RESULTS_WITHIN_S)
+        before, deadline = "", 0.0
         while missing := self.recorder.missing(result.blocks):
-            if time.monotonic() > deadline:
+            if missing != before:  # fits may take longer than the blocks did
+                before, deadline = missing, time.monotonic() + self._time.patience_s(RESULTS_WITHIN_S)
+            elif time.monotonic() > deadline:
                 raise PointDisturbed(missing, "messages lost")
             try:
                 check()

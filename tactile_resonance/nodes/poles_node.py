@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rclpy.subscription import Subscription
-
 from tactile_resonance import msg
 from tactile_resonance.calibration.estimator import CalibratedEstimator, calibrated_poles
 from tactile_resonance.calibration.model import read_calibration
@@ -63,15 +61,10 @@ PARAMETERS = (
 )
 
 
-LATER = "not estimated: the FRF of a later block was waiting already"
-
-
 class PolesNode(ManagedNode):
     """Every FRF that arrives becomes poles, with the same header.
 
-    In the bands that its excitation names; the parameters hold for an FRF that names none. Where fits take
-    longer than blocks, only the latest FRF of a measurement is fitted, which holds all blocks before it; the
-    others are answered without poles.
+    In the bands that its excitation names; the parameters hold for an FRF that names none.
     """
 
     def __init__(self) -> None:
@@ -86,19 +79,9 @@ class PolesNode(ManagedNode):
             known = read_calibration(Path(calibration))
             self._sensor = CalibratedEstimator(known.calibration, known.tip_radius_m)
         self._publisher = self.publish_on(msg.Poles, "poles", POLES)
-        self._frfs = self.listen(msg.FRF, "frf", self._on_frf, RESULTS)
+        self.listen(msg.FRF, "frf", self._on_frf, RESULTS)
 
     def _on_frf(self, message: msg.FRF) -> None:
-        waiting = [message, *_taken_from(self._frfs)]
-        latest = {of.measurement_id: of for of in waiting}
-        for of in waiting:
-            if latest[of.measurement_id] is of:
-                self._answer(of)
-            else:
-                poles = Poles(status=PolesStatus.FAILED, message=LATER)
-                self._publisher.publish(poles_to_message(poles, origin_from_message(of)))
-
-    def _answer(self, message: msg.FRF) -> None:
         try:
             frf, origin = frf_from_message(message)
             poles = self._identify(frf, origin.contact)
@@ -119,15 +102,6 @@ class PolesNode(ManagedNode):
         if not (force_n > 0 and force_std_n >= 0):
             force_n, force_std_n = float("nan"), 0.0
         return calibrated_poles(frf, bands, self._sensor, force_n, force_std_n, method)
-
-
-def _taken_from(subscription: Subscription) -> list[msg.FRF]:
-    """What waits in the queue of a subscription, oldest first."""
-    found = []
-    with subscription.handle:
-        while (taken := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
-            found.append(taken[0])
-    return found
 
 
 main = PolesNode.run

@@ -91,18 +91,18 @@ def run_node(make: Callable[[], Node]) -> None:
     ended all the same.
     """
     keep_memory()
-    interrupted = False
+    ending = False
 
     def end_in_time(*_: object) -> None:
+        nonlocal ending
+        ending = True
         # by a thread that needs no interpreter: the middleware hangs with the interpreter's lock where another
         # process was killed while it held a port of the shared memory
         faulthandler.dump_traceback_later(END_WITHIN_S, exit=True, file=STDERR)
 
     def interrupt(*_: object) -> None:
-        nonlocal interrupted
-        if interrupted:
+        if ending:
             return
-        interrupted = True
         end_in_time()
         raise KeyboardInterrupt
 
@@ -116,8 +116,9 @@ def run_node(make: Callable[[], Node]) -> None:
             try:
                 rclpy.spin(node)
             except (RuntimeError, RCLError):
-                # what rclpy makes of an interrupt that meets it while it takes a message
-                if not interrupted:
+                # what rclpy makes of an interrupt that meets it while it takes a message, or of SIGTERM, on
+                # which it shuts down in a thread of its own, while it waits for one
+                if not ending:
                     raise
             finally:
                 node.destroy_node()

@@ -16,6 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from tactile_resonance.action import Measure
 
 from tactile_resonance import msg
+from tactile_resonance.nodes import measure_client
 from tactile_resonance.nodes.fake_hardware_node import FakeHardwareNode
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.measure_client import MeasureClient, ScanRecorder
@@ -24,7 +25,7 @@ from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, initial
 from tactile_resonance.nodes.simulated_tip import truth_message
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.scan.hands import PointFailed
+from tactile_resonance.scan.hands import PointDisturbed, PointFailed
 from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import POLES_TYPE, PointResult
 from tactile_resonance.scan.points import ScanPoint
@@ -165,3 +166,30 @@ def test_a_contact_that_is_seen_lost_after_the_last_block_was_lost_in_it():
     polls.clear()
     with pytest.raises(PointFailed, match="contact_lost"):
         client._follow(*asked, held)
+
+
+@pytest.mark.parametrize("blocks", [30, 31])
+def test_results_are_waited_for_as_long_as_they_come(monkeypatch, blocks):
+    """Fits that take four times as long as their blocks are 90 s behind after 30 blocks of 1 s."""
+    now_s, fit_s = [0.0], 4.0
+    monkeypatch.setattr(measure_client.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(
+        measure_client.time, "sleep", lambda seconds: now_s.__setitem__(0, now_s[0] + seconds)
+    )
+
+    def missing(wanted):
+        came = min(int(now_s[0] / fit_s), 30)  # a thirty-first never comes
+        return "" if came >= wanted else f"of {wanted} blocks came {came} poles"
+
+    client = MeasureClient.__new__(MeasureClient)
+    client._time = SimpleNamespace(patience_s=lambda s: s)
+    client.recorder = SimpleNamespace(missing=missing)
+    result = Measure.Result(outcome=Measure.Result.DONE, blocks=blocks)
+    if blocks == 30:
+        client._wait_for_results(result, lambda: None)
+        assert now_s[0] == pytest.approx(30 * fit_s, abs=2 * measure_client.POLL_S)
+    else:
+        with pytest.raises(PointDisturbed, match="of 31 blocks came 30 poles"):
+            client._wait_for_results(result, lambda: None)
+        limit_s = 30 * fit_s + measure_client.RESULTS_WITHIN_S
+        assert now_s[0] == pytest.approx(limit_s, abs=2 * measure_client.POLL_S)

@@ -3,7 +3,6 @@
 
 import array
 import os
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 import rclpy
-import rclpy.duration
 
 from tactile_resonance import msg
 from tactile_resonance.frf.result import FRF, FrfStatus
@@ -24,7 +22,7 @@ from tactile_resonance.nodes.messages import (
     record_to_message,
 )
 from tactile_resonance.nodes.poles_node import PolesNode
-from tactile_resonance.nodes.running import RESULTS, initialised
+from tactile_resonance.nodes.running import initialised
 from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Channel, Origin, Record
@@ -87,31 +85,6 @@ def test_a_broken_frf_gets_a_failure_with_a_reason(node, case):
     assert len(failed.f0_hz) == 0
     assert after.status == msg.Poles.STATUS_OK
     assert after.f0_hz[0] == pytest.approx(250, rel=1e-6)
-
-
-def test_of_the_frfs_of_a_measurement_that_wait_only_the_latest_is_fitted(node):
-    publisher = node.create_publisher(msg.FRF, "frf", RESULTS)
-    sent = []
-    for measurement_id, count in ((1, 3), (2, 1), (3, 2)):
-        for block in range(count):
-            message = good()
-            message.measurement_id, message.excitation_id = measurement_id, 10 * measurement_id + block
-            sent.append(message)
-    while not publisher.get_subscription_count():
-        rclpy.spin_once(node, timeout_sec=0.1)
-    for message in sent:
-        publisher.publish(message)
-    assert publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=30))
-    deadline_s = time.monotonic() + 60
-    while len(node.published) < len(sent) and time.monotonic() < deadline_s:
-        rclpy.spin_once(node, timeout_sec=0.1)
-    assert [poles.excitation_id for poles in node.published] == [10, 11, 12, 20, 30, 31]
-    fitted = [poles for poles in node.published if poles.status == msg.Poles.STATUS_OK]
-    assert [poles.excitation_id for poles in fitted] == [12, 20, 31]
-    assert all(poles.f0_hz[0] == pytest.approx(250, rel=1e-6) for poles in fitted)
-    others = [poles for poles in node.published if poles not in fitted]
-    assert all(poles.status == msg.Poles.STATUS_FAILED for poles in others)
-    assert all(len(poles.f0_hz) == 0 and "later block" in poles.message for poles in others)
 
 
 @pytest.mark.parametrize("modes", [1, 2])

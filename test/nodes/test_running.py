@@ -17,7 +17,7 @@ from rclpy.lifecycle.node import LifecycleNodeMixin
 
 from tactile_resonance.nodes import running
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.running import END_WITHIN_S, initialised, run_node
+from tactile_resonance.nodes.running import END_WITHIN_S, RCLError, initialised, run_node
 from tactile_resonance.processes import free_domain_id
 
 
@@ -51,6 +51,18 @@ def test_an_interrupt_that_meets_the_middleware_at_work_is_no_crash(node, monkey
         except KeyboardInterrupt as error:
             # as pybind11 hands on what is raised while it converts a message
             raise RuntimeError("Unable to convert call argument '0'") from error
+
+    monkeypatch.setattr(rclpy, "spin", spin)
+    run_node(node)
+    assert limits == [END_WITHIN_S]
+
+
+def test_a_shutdown_that_meets_the_middleware_at_work_is_no_crash(node, monkeypatch, limits):
+    """On SIGTERM rclpy shuts down in a thread of its own, and what the executor does then may fail."""
+
+    def spin(_):
+        signal.raise_signal(signal.SIGTERM)
+        raise RCLError("failed to initialize wait set: the given context is not valid")
 
     monkeypatch.setattr(rclpy, "spin", spin)
     run_node(node)
