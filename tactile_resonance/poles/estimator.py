@@ -24,7 +24,7 @@ from tactile_resonance.poles.joint import JointPlan, PoleEstimator, whole_harmon
 from tactile_resonance.poles.noise_level import channels_of, two_channels
 from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
-from tactile_resonance.poles.tones import has_tones, poles_without_tones
+from tactile_resonance.poles.tones import has_tones, noise_without_one_tone, poles_without_tones
 
 POLES_METHODS = ("auto", "joint", "frf")
 
@@ -225,8 +225,13 @@ def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
     drifted = None
     if y.ndim == 1 and plan.periods > 1 and plan.others_at.size:
         drifted = poles_with_drift(plan, u, y, batch)
-        # a drift fills the bins beside a line as tones would, for which dozens of fits are made
-        if drifted is not None and not has_tones(plan, u, drifted.rest, drifted.fit):
+        # a drift fills the bins beside a line as tones would, for which dozens of fits are made; it takes up a
+        # tone beside a narrow mode, too, but leaves more noise than there is without the tone
+        if (
+            drifted is not None
+            and not has_tones(plan, u, drifted.rest, drifted.fit)
+            and drifted.fit.noise_variance[0] < noise_without_one_tone(plan, u, y, batch)
+        ):
             return drifted.poles
     rest, tones = poles_without_tones(plan, u, y, batch)
     # what leaves less noise is right

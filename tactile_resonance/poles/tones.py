@@ -181,6 +181,22 @@ def has_tones(plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBat
     return _most_striking(_Fitted(plan, batch, np.atleast_2d(u), np.atleast_2d(y))) is not None
 
 
+def noise_without_one_tone(
+    plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch
+) -> float:
+    """Variance of the noise of y that is left once what stands out most is taken off as a tone.
+
+    Of bins and a fit as `has_tones` takes them. Infinite where no bin stands out, or too few lines are left.
+    """
+    found = _most_striking(_Fitted(plan, batch, np.atleast_2d(u), np.atleast_2d(y)))
+    if found is None:
+        return np.inf
+    try:
+        return float(_taken_too(plan, u, y, [], *found)[1].batch.noise_variance[0])
+    except ValueError:  # too few lines are left
+        return np.inf
+
+
 def poles_without_tones(
     plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch
 ) -> tuple[PolesBatch, tuple[Tone, ...]]:

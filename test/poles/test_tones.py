@@ -194,6 +194,20 @@ def test_noise_is_no_tone():
     assert not any("tone" in poles.message for poles in found)
 
 
+@pytest.mark.parametrize("frequency_hz", [249.2, 250.9, 251.2])
+def test_a_tone_beside_a_narrow_mode_is_no_drift_of_it(frequency_hz):
+    """A drift of the mode takes it up, and no bin stands out any more; without it less noise is left."""
+    plant = Plant(0.005, 30.0, 2)
+    amplitude_v = 30 * np.sqrt(plant.noise[0])
+
+    def disturb(rng, u, y):
+        return u, y + tone(plant, frequency_hz, amplitude_v, rng.uniform(0, 2 * np.pi))
+
+    found = runs([plant], 40, disturb)
+    assert sum("tone" in poles.message for poles in found) >= 32
+    assert sum("changes" in poles.message for poles in found) <= 6
+
+
 def test_one_noisy_realisation_of_four_holds_no_tones():
     """Its noise is ten times as large. Before: tones in 15 of 60."""
     plants = [Plant(0.02, 40.0, 2, seed) for seed in range(4)]
