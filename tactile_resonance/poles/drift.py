@@ -21,7 +21,7 @@ import scipy.fft
 from numpy.polynomial import legendre
 from scipy import special
 
-from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData, rough_noise, with_noise
 from tactile_resonance.poles.fit import Linearised
 from tactile_resonance.poles.joint import JointPlan
@@ -65,13 +65,6 @@ TOO_NARROW = (
     "what decays from the start of the record changes faster than it decays: the mode is too narrow for such a "
     "drift, and its poles may be off by more than they state"
 )
-# How often noise that lasts would be said to be of one moment, and what the limit of that is taken times: noise
-# that comes and goes, and a drift, are below it.
-OF_ONE_MOMENT, COMES_AND_GOES = 1e-3, 2.0
-KNOCKED = (
-    "what the fit leaves is of one moment of the record, as a knock or lost contact makes it, and passes for a "
-    "transient or a change of the mode: measure again"
-)
 # Of the record, from -1 to 1, among which that is found where the change is nearest to its mean.
 TIMES = np.linspace(-1, 1, 2001)
 USABLE = (PolesStatus.OK, PolesStatus.MODEL_ERROR)
@@ -91,8 +84,6 @@ class _Step:
         What the coefficients change by with the drift, with a minus.
     level, dof : float
         Of the noise, in units of the variances weighted with, and its complex degrees of freedom.
-    knocks : (2 K,) bool
-        Instants of the record at which the errors between harmonics are, see `_knocks`.
     """
 
     step: FloatArray
@@ -100,7 +91,6 @@ class _Step:
     coefficients: FloatArray
     level: float
     dof: float
-    knocks: BoolArray
 
     @property
     def covariance(self) -> FloatArray:
@@ -307,19 +297,7 @@ def _linearised(
     dof = plan.bins.size - (theta.size + count) / 2
     fall = min(float(-score @ step) / cost, 1.0)
     level = cost * (1 - fall) / dof
-    between = np.zeros(plan.bins.size, complex)
-    between[plan.order[:others]] = at.error[0, :others] / np.sqrt(known.variance[0, :others])
-    return _Step(step, left, coefficients, level, dof, _knocks(between))
-
-
-def _knocks(error: ComplexArray) -> BoolArray:
-    """(2 K,) instants at which weighted errors of the bins of a band (K,), 0 on those that do not count, are.
-
-    Errors that last have independent phases from bin to bin, whatever their colour: the square of their sum
-    at an instant is then exponential, in units of its mean over the record.
-    """
-    power = np.abs(scipy.fft.ifft(error, 2 * error.size)) ** 2
-    return np.asarray(power > power.mean() * COMES_AND_GOES * np.log(power.size / OF_ONE_MOMENT))
+    return _Step(step, left, coefficients, level, dof)
 
 
 def _converged(
@@ -364,8 +342,7 @@ def poles_with_drift(
     -------
     Drifted or None
         None where nothing changes beyond chance. Status MODEL_ERROR where something changes that is no drift of
-        the poles: the gain too, as where contact is lost, or no fit with drift is found; then `rest` is y. The
-        same where errors of one moment pass for a change or, near either end of the record, for a transient.
+        the poles: the gain too, as where contact is lost, or no fit with drift is found; then `rest` is y.
     """
     modes, found = DriftingModes(plan, fit, u), None
     with np.errstate(all="ignore"):
@@ -374,14 +351,7 @@ def poles_with_drift(
         if fit.status() not in USABLE or not modes.there.size:
             return None
         at = _linearised(modes, y, [1], flat=True)
-        if at is None:
-            return None
-        changes = at.chance(at.step) < FALSE_ALARM
-        near = 2 * plan.problem.sizes[2]  # either end, as far as so many terms of a transient reach
-        transient = at.knocks[:near].any() or at.knocks[-near:].any()
-        if (transient and fit.status() is PolesStatus.OK) or (changes and at.knocks.any()):
-            return Drifted(_changed(single(fit), KNOCKED), fit, y)
-        if not changes:
+        if at is None or not at.chance(at.step) < FALSE_ALARM:
             return None
         none = np.zeros((1, modes.there.size, 2))
         drift = none

@@ -263,28 +263,6 @@ def test_a_spring_that_changes_is_a_drift_of_its_mode(power):
         assert abs(poles.f0_hz[0] - F0_HZ) < 5 * np.sqrt(poles.covariance[0, 0, 0])
 
 
-def knocked(sample, size, structure):
-    """Poles of four periods: from an instant on a mode rings freely, too."""
-    u, y = record(4, 0.0, 0.0, seed=sample)
-    time_s = (np.arange(y.size) - sample) / RATE_HZ
-    ring = np.exp(-2 * np.pi * F0_HZ * DAMPING * time_s.clip(0)) * np.sin(2 * np.pi * F0_HZ * time_s)
-    knock = size * (ring * (time_s > 0)).reshape(y.shape)
-    return next(repeated((u, y + knock), 5e-3, structure, runs=1, first=sample))
-
-
-def test_a_knock_is_no_drift():
-    """Five times the sensor's rms. Before: a drift in one of these records."""
-    for sample in np.random.default_rng(6).integers(100, 7900, 60):
-        assert knocked(int(sample), 1.0, BARE).f0_drift_hz_per_s is None
-
-
-def test_a_knock_near_the_start_is_no_mode():
-    """Before: ok in 10 of 25, with .3 to .7 of the damping ratio, 13 to 19 deviations off."""
-    for sample in range(60, 260, 8):
-        poles = knocked(sample, 5.0, ModelStructure())
-        assert poles.status in (PolesStatus.MODEL_ERROR, PolesStatus.NO_RESONANCE)
-
-
 @pytest.mark.parametrize("kind", ["gain", "step", "lost"])
 def test_a_gain_that_changes_is_no_drift_of_a_mode(kind):
     """An amplifier, or a contact that is lost in the last period: poles are constant, and no drift is sure."""
