@@ -137,9 +137,9 @@ def listen(options: argparse.Namespace) -> int:
 
     try:
         validate_namespace(f"/{options.namespace.strip('/')}")
-    except InvalidNamespaceException as error:
+    except InvalidNamespaceException:
         accepted = "a ROS namespace: letters, digits, _ and /, no digit at the beginning of a part"
-        require(not error, "--namespace", options.namespace, accepted)
+        require(False, "--namespace", options.namespace, accepted)
     from tactile_resonance.nodes.client import LiveListener
 
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")

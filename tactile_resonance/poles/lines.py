@@ -218,7 +218,7 @@ def lines_of_spectra(
     usable = np.isfinite(z).all(axis=-2) & np.isfinite(c).all(axis=(-3, -2))
     noise_y, noise_u = (usable & (c[:, k, k].real > 0) for k in (0, 1))
     level_known = np.asarray((noise_y | noise_u).any(axis=-1))
-    # lines of one channel without variance, beside others with one, are none of the noise's making
+    # where other lines of a channel have a variance, it is unknown on a line without one
     usable &= noise_y | ~noise_y.any(axis=-1, keepdims=True)
     usable &= noise_u | ~noise_u.any(axis=-1, keepdims=True)
     z = np.where(usable[:, None], z, 0.0)
@@ -358,11 +358,11 @@ class LinesPlan(FitPlan):
 
     @property
     def _one_by_one(self) -> bool:
-        """Whether the model is none for the compiled fit."""
+        """Whether the compiled fit does not have the model."""
         return self.structure.delay or self.structure.order > LARGEST_BATCHED_ORDER
 
     def batched(self, data: BinData) -> tuple[LinesPlan, Solution]:
-        """As `FitPlan.batched`; models that are none for it at full precision."""
+        """As `FitPlan.batched`; at full precision models that the compiled fit does not have."""
         if not self._one_by_one:
             return super().batched(data)
         return (self if self.structure.delay else self.settled(data))._fit_dense(data)

@@ -40,7 +40,7 @@ NOISE_PASSES_FOR_A_MODE = 1e-4
 PARAMETERS_OF_A_MODE = 4
 # Squared distance of a residue from zero, in its deviations, beyond which linear propagation is exact enough.
 LINEAR = 100.0
-# A single mode whose damping ratio is known to this part is none of noise's making: its residue is known
+# A single mode whose damping ratio is known to this part of itself was not made by noise: its residue is known
 # about as well, ten times better than the test below asks for.
 CERTAIN = 0.02
 

@@ -85,6 +85,19 @@ def test_a_node_that_ends_closes_its_device(monkeypatch):
     assert closed == [True]
 
 
+@contextlib.contextmanager
+def active_node(monkeypatch, tmp_path, device):
+    """An active excitation_node with a device of the test's own, that writes records to a folder."""
+    monkeypatch.setattr(devices, "make_device", lambda _: (device, ()))
+    given = ["--ros-args", "-p", f"record_folder:={tmp_path}"]
+    with initialised(args=given, domain_id=free_domain_id(os.environ)):
+        node = ExcitationNode()
+        node.trigger_configure()
+        node.trigger_activate()
+        yield node
+        node.destroy_node()
+
+
 @pytest.mark.parametrize(
     ("raises", "kind", "outcome"),
     [
@@ -112,14 +125,8 @@ def test_what_an_error_means_is_a_matter_of_how_far_the_measurement_came(
             peak_v = 0.0 if raises == "" else math.inf
             return SimpleNamespace(name="weak", output_peak_v=peak_v)
 
-    monkeypatch.setattr(devices, "make_device", lambda _: (Device(), ()))
-    given = ["--ros-args", "-p", f"record_folder:={tmp_path}"]
-    with initialised(args=given, domain_id=free_domain_id(os.environ)):
-        node = ExcitationNode()
-        node.trigger_configure()
-        node.trigger_activate()
+    with active_node(monkeypatch, tmp_path, Device()) as node:
         result = node._measure(SimpleNamespace(request=Measure.Goal(level_v=0.1)), node._device)
-        node.destroy_node()
     assert result.outcome == outcome
     expected = f"device: cannot {raises}" if raises else "level_v: peak"
     assert result.message.startswith(expected)
@@ -163,12 +170,7 @@ def test_a_record_is_kept_and_handed_out_with_what_is_told_of_its_contact(monkey
         asked.append((start_ns, end_ns))
         return lambda: told
 
-    monkeypatch.setattr(devices, "make_device", lambda _: (Device(), ()))
-    given = ["--ros-args", "-p", f"record_folder:={tmp_path}"]
-    with initialised(args=given, domain_id=free_domain_id(os.environ)):
-        node = ExcitationNode()
-        node.trigger_configure()
-        node.trigger_activate()
+    with active_node(monkeypatch, tmp_path, Device()) as node:
         node._contact = SimpleNamespace(ask=ask)
         monkeypatch.setattr(node._records, "publish", published.append)
         goal = SimpleNamespace(
@@ -177,7 +179,6 @@ def test_a_record_is_kept_and_handed_out_with_what_is_told_of_its_contact(monkey
             is_cancel_requested=False,
         )
         result = node._measure(goal, node._device)
-        node.destroy_node()
     assert (result.message, result.blocks) == ("", 1)
     (file,) = tmp_path.rglob("record-*.npz")
     kept, (message,) = read_stored(file, Record), published
