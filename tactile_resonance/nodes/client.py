@@ -7,6 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,17 +67,21 @@ class NodeClient(ABC):
         return ""
 
     def __enter__(self) -> Self:
-        rclpy.init(context=self._context)
-        self._node = rclpy.create_node(self._name, context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self.join()
+        # an initialised context that is dropped stays known to rclpy's handler of signals, which then crashes
+        with ExitStack() as opened:
+            rclpy.init(context=self._context)
+            opened.callback(rclpy.shutdown, context=self._context)
+            self._node = rclpy.create_node(self._name, context=self._context)
+            opened.callback(self._node.destroy_node)
+            self._executor = SingleThreadedExecutor(context=self._context)
+            opened.callback(self._executor.shutdown)
+            self._executor.add_node(self._node)
+            self.join()
+            self._opened = opened.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
+        self._opened.close()
 
     def spin(self, seconds: float) -> None:
         """Let messages in for at most so long."""

@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not here")
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
+import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
@@ -535,9 +536,12 @@ def test_scan_goal_needs_no_manager(stack, monkeypatch, tmp_path):
 def test_scan_goal_refuses_in_one_line_what_it_cannot_use(given, told, monkeypatch, capsys):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain_id(os.environ)))
     monkeypatch.setattr(sys, "argv", ["scan_goal", "--ros-args", *given])
+    context = rclpy.Context()
+    monkeypatch.setattr(rclpy, "Context", lambda: context)
     with pytest.raises(SystemExit) as ended:
         scan_goal.main()
     assert ended.value.code == 1
+    assert not context.ok()
     said = capsys.readouterr().err
     assert told in said
     assert said.count("\n") == 1
