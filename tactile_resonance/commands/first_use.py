@@ -17,7 +17,7 @@ STEPPED = tuple(
     for name in (
         *("contact.contact_filter", "simulation.cell.transducer"),
         *("simulation.noise", "simulation.sensor.nonlinear", "simulation.tissue.indenter"),
-        *(f"simulation.ur5e.{name}" for name in ("forces", "kinematics")),
+        "simulation.ur5e.kinematics",
     )
 )
 """Modules of what is stepped hundreds of times a second, compiled as they are imported."""

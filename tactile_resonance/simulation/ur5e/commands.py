@@ -244,7 +244,7 @@ class Program(CommandLoop):
             4: lambda: self._move(motion.movel, Posture(doubles()).tool(target.tcp)),
             6: self._force_mode,
             7: self._end_force_mode,
-            8: machine.sensor.zero,
+            8: machine.zero_sensor,
             9: lambda: self._speed(motion.speedj),
             10: lambda: self._speed(motion.speedl),
             11: lambda: self._servo(doubles()),

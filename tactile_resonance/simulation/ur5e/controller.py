@@ -13,7 +13,6 @@ gains, the threshold of tool contact, servoj's gain, currents) the model's own s
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from enum import IntEnum
@@ -302,13 +301,13 @@ class UrController:
         if self.program is not None:
             self._run_program()
         self.machine.step(self.powered)
-        force = math.hypot(*self.machine.tcp_force[:3])
+        force = self.machine.pressed_n
         if force > self.machine.config.limits.tool_force_n and self.may_move:
             self.protective_stop(f"force of {force:.0f} N at the tool")
         if self._next_mode is not None and self.time_s >= self._due_s:
             self.robot_mode, self._next_mode = self._next_mode, None
         if self.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP:
-            at_rest = not any(target.qd) and largest(self.machine.joints.qd) < _AT_REST_RAD_S
+            at_rest = not any(target.qd) and largest(self.machine.qd) < _AT_REST_RAD_S
             if at_rest and self.robot_mode is not RobotMode.POWER_OFF:
                 self.power_off()
         if self.runtime_state is RuntimeState.STOPPING and not any(target.qd):
@@ -319,7 +318,8 @@ class UrController:
         try:
             if not self.program.step():
                 self._end_program("ended by its client")
-            self.machine.force_mode.step(self.machine.tcp_force)
+            if self.machine.force_mode.task is not None:
+                self.machine.force_mode.step(self.machine.tcp_force)
         except ProtectiveStop as stop:
             self.protective_stop(str(stop))
         except ScriptError as error:

@@ -7,8 +7,6 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import float64, njit
-from numba.types import UniTuple
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Turn, Vector, cross, rotated, rotated_back
@@ -19,13 +17,10 @@ from tactile_resonance.simulation.ur5e.poses import (
     Six,
     Transform,
     beside,
-    difference,
-    total,
 )
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
 
 STANDARD_GRAVITY_M_S2 = 9.80665
-_6 = UniTuple(float64, 6)
 
 
 @dataclass(frozen=True)
@@ -72,33 +67,9 @@ class ToolPayload:
     cog_m: Vector = ORIGIN
     inertia_kg_m2: Six = ZERO
 
-    def weight(self, flange: Turn, gravity_m_s2: Vector) -> Six:
-        """Return its weight as a wrench on the flange, in the flange's frame.
-
-        Parameters
-        ----------
-        flange : Turn
-            Rotation of the flange in the base.
-        gravity_m_s2 : Vector
-            Acceleration of free fall in the base.
-        """
-        if self.mass_kg == 0.0:
-            return ZERO
-        x, y, z = rotated_back(flange, gravity_m_s2)
-        force = (x * self.mass_kg, y * self.mass_kg, z * self.mass_kg)
-        return *force, *cross(self.cog_m, force)
-
 
 class FtSensor:
-    """The sensor and the controller's compensation of payload and offset.
-
-    Wrenches are what acts on the flange from outside.
-
-    Attributes
-    ----------
-    raw : 6 floats
-        Measured at the flange, in its frame, nothing compensated (``ft_raw_wrench``).
-    """
+    """The sensor: what it says beside the wrench that acts on the flange from outside."""
 
     def __init__(self, specification: FtSpecification, random: np.random.Generator) -> None:
         self._offset = specification.accuracy / 2 * random.standard_normal(6)
@@ -109,9 +80,6 @@ class FtSensor:
         kick = self._drift_rms * np.sqrt(1 - keep**2)
         self._rms = np.concatenate([kick, sigma * np.sqrt(1 - specification.drift_share)])
         self.reseed(random)
-        self._zero = ZERO
-        self._free = ZERO
-        self.raw = ZERO
 
     def reseed(self, random: np.random.Generator) -> None:
         """Take all noise from the next step on from a generator, drift drawn anew; the offset stays."""
@@ -127,57 +95,11 @@ class FtSensor:
         errors = self._offset + drifts + numbers[:, 6:]
         self._errors = [*map(tuple, errors[::-1].tolist())]
 
-    def step(self, true: Six, payload_weight: Six, external: Six | None = None) -> None:
-        """Measure for one cycle; all wrenches at and in the flange.
-
-        Parameters
-        ----------
-        true : 6 floats
-            What acts on the flange.
-        payload_weight : 6 floats
-            Weight to be compensated.
-        external : 6 floats, optional
-            Measured by another sensor, to be used in place of this one's reading.
-        """
+    def error(self) -> Six:
+        """Return what it reads in the next cycle beside the truth, at and in the flange [N], [N m]."""
         if not self._errors:
             self._draw()
-        self.raw = total(true, self._errors.pop())
-        self._free = difference(self.raw if external is None else external, payload_weight)
-
-    def zero(self) -> None:
-        """Take the wrench without payload as zero (``zero_ftsensor``)."""
-        self._zero = self._free
-
-    def at_tcp(self, flange: Turn, tcp_m: Vector) -> Six:
-        """Return the compensated wrench at the TCP, along the axes of the base.
-
-        Parameters
-        ----------
-        flange : Turn
-            Rotation of the flange in the base.
-        tcp_m : Vector
-            Place of the TCP in the flange.
-        """
-        return _at_tcp(self._free, self._zero, flange, tcp_m)
-
-
-@njit(_6(_6, _6, UniTuple(float64, 9), UniTuple(float64, 3)), cache=True)
-def _at_tcp(free, zero, flange, tcp_m):
-    """See `FtSensor.at_tcp`."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = flange
-    fx, fy, fz = free[0] - zero[0], free[1] - zero[1], free[2] - zero[2]
-    (x, y, z), (mx, my, mz) = tcp_m, free[3:]
-    mx = mx - zero[3] + (fy * z - fz * y)
-    my = my - zero[4] + (fz * x - fx * z)
-    mz = mz - zero[5] + (fx * y - fy * x)
-    return (
-        xx * fx + xy * fy + xz * fz,
-        yx * fx + yy * fy + yz * fz,
-        zx * fx + zy * fy + zz * fz,
-        xx * mx + xy * my + xz * mz,
-        yx * mx + yy * my + yz * mz,
-        zx * mx + zy * my + zz * mz,
-    )
+        return self._errors.pop()
 
 
 # Speed per missing force or torque at a gain scaling of 1 [m/s/N, rad/s/(N m)], and the time constant
@@ -252,16 +174,15 @@ class ForceMode:
         self._speed = ZERO
 
     def step(self, measured: Six) -> None:
-        """Move the target aside for one cycle; raises as `Target.command`.
+        """Move the target aside for one cycle of force mode; raises as `Target.command`.
 
         Parameters
         ----------
         measured : 6 floats
             Wrench on the TCP from outside, along the axes of the base.
         """
-        if self.task is None:
-            return
         task, target = self.task, self._target
+        assert task is not None
         axes = self._axes(task, target)
         fx, fy, fz, mx, my, mz = measured
         outside = (*rotated_back(axes, (fx, fy, fz)), *rotated_back(axes, (mx, my, mz)))

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from numba import boolean, float64, njit
+from numba import boolean, float64, njit, void
 from numba.types import UniTuple
 
 from tactile_resonance.contact.vectors import Vector, cross
@@ -29,6 +29,7 @@ D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
 _EDGE = 1e-9
 
 _3, _6, _9, _12 = (UniTuple(float64, n) for n in (3, 6, 9, 12))
+_ROWS = float64[:, ::1]
 
 
 @njit(_12(_9, _3, _9, _3), cache=True)
@@ -140,8 +141,6 @@ class Posture:
     ----------
     q : tuple of 6 float
         Joint angles [rad].
-    numbers : tuple of 24 float, optional
-        Of the same posture, where `motion_to` or `motion_towards` has told them.
 
     Attributes
     ----------
@@ -153,10 +152,9 @@ class Posture:
 
     __slots__ = ("_numbers", "_tools", "flange", "q")
 
-    def __init__(self, q: Six, numbers: tuple | None = None) -> None:
+    def __init__(self, q: Six) -> None:
         self.q = q
-        if numbers is None:
-            numbers = _posture(q)
+        numbers = _posture(q)
         self.flange: Transform = numbers[:9], numbers[9:12]
         self._numbers = numbers[12:]
         self._tools: list[tuple[Transform, Transform]] = [(IDENTITY, self.flange)]
@@ -301,7 +299,7 @@ def nearest_inverse(flange: Transform, near: Six, joint_range_rad: float = math.
     return tuple(joints) if way < math.inf else None
 
 
-@njit(UniTuple(float64, 37)(_9, _3, _6, _6, float64, _9, _3, _9, _3), cache=True)
+@njit(UniTuple(float64, 13)(_9, _3, _6, _6, float64, _9, _3, _9, _3), cache=True)
 def motion_to(turn, place_m, twist, near, joint_range_rad, tcp, tcp_m, back, back_m):
     """Return the motion of the joints that brings a TCP to a place with a twist, as numbers.
 
@@ -318,15 +316,15 @@ def motion_to(turn, place_m, twist, near, joint_range_rad, tcp, tcp_m, back, bac
 
     Returns
     -------
-    37 floats
-        Joint angles [rad] (6), numbers of their `Posture` (24), joint speeds [rad/s] (6), NaN at a singularity;
-        how far the angles are from `near` [rad], infinite out of reach.
+    13 floats
+        Joint angles [rad] (6), joint speeds [rad/s] (6), NaN at a singularity; how far the angles are from
+        `near` [rad], infinite out of reach.
     """
     flange = _product(turn, place_m, back, back_m)
     found = _nearest(flange[:9], flange[9:], near, joint_range_rad)
     numbers = _posture(found[:6])
     point_m = _product(numbers[:9], numbers[9:12], tcp, tcp_m)[9:]
-    return found[:6] + numbers + _speeds(numbers[12:], point_m, twist) + found[6:]
+    return found[:6] + _speeds(numbers[12:], point_m, twist) + found[6:]
 
 
 @njit
@@ -348,9 +346,12 @@ def _turned(turn, x, y, z):
     return _product(further, nowhere, turn, nowhere)[:9]
 
 
-@njit(UniTuple(float64, 38)(*[_6] * 3, *[float64] * 2, boolean, float64, *[_9, _3] * 2), cache=True)
+@njit(
+    UniTuple(float64, 15)(*[_6] * 3, *[float64] * 2, boolean, *[float64] * 2, *[_9, _3] * 2),
+    cache=True,
+)
 def motion_towards(
-    q, qd, goal, most, period_s, straight, joint_range_rad, tcp, tcp_m, back, back_m
+    q, qd, goal, most, period_s, straight, joint_range_rad, joint_speed_rad_s, tcp, tcp_m, back, back_m
 ):  # fmt: skip
     """Return the motion of the joints that brings the twist of a TCP nearer to a goal in a period.
 
@@ -366,11 +367,14 @@ def motion_towards(
         Moving and turning end together, so that the path is kept.
     joint_range_rad, tcp, tcp_m, back, back_m
         See `motion_to`.
+    joint_speed_rad_s : float
+        Largest speed of a joint.
 
     Returns
     -------
-    38 floats
-        As of `motion_to`, and last whether the goal is reached.
+    15 floats
+        As of `motion_to`; whether the goal is reached; whether no joint passes its range or its speed, on the
+        way and at its end.
     """
     numbers = _posture(q)
     tool = _product(numbers[:9], numbers[9:12], tcp, tcp_m)
@@ -391,4 +395,175 @@ def motion_towards(
     place = (px + (vx + x) * mean_s, py + (vy + y) * mean_s, pz + (vz + z) * mean_s)
     twist = (x, y, z, rx, ry, rz)
     found = motion_to(turned, place, twist, q, joint_range_rad, tcp, tcp_m, back, back_m)
-    return found + (1.0 if reached else 0.0,)
+    within = True
+    for k in range(6):
+        on_the_way, then = (found[k] - q[k]) / period_s, found[6 + k]
+        within = within and abs(found[k]) <= joint_range_rad
+        within = within and max(abs(on_the_way), abs(then)) <= joint_speed_rad_s
+    return found + (1.0 if reached else 0.0, 1.0 if within else 0.0)
+
+
+FLANGE, TOOL, TOUCH, SEEN, SPEEDS, TWIST, WRENCHES, TCP, TIP, MASSES, FALL, ARM_ROWS = range(12)
+"""Rows of an arm's state, 12 numbers each, and how many there are: turn and place of the flange, the TCP, and
+the tip where it trembles; joint angles and the wrench on the TCP; joint speeds in this cycle and in the one
+before; twist of the TCP, and the wrench that is taken for zero; wrench on the flange as measured, and without
+payload.
+
+What is set: TCP and tip in the flange; masses [kg] with their centres of gravity, of the tool, of the payload
+that is compensated, and of what of that an external sensor does not feel; acceleration of free fall, place of
+that sensor in the flange, and what it measures there."""
+
+
+@njit(void(_ROWS, float64[::1]), cache=True)
+def behind(lag, how):
+    """Let axes follow their set points for a period, exactly for those that run linearly over it.
+
+    Parameters
+    ----------
+    lag : (4 + n, axes) array
+        Where the axes are, the set points that reached them last, and those on their way, oldest first; the
+        last is that of the end of the period.
+    how : (3,) array
+        Share of a period by which the dead time is longer than n of them; decay and slope of the lag.
+    """
+    fraction, decay, slope = how
+    for k in range(lag.shape[1]):
+        value, before, now = lag[0, k], lag[1, k], lag[3, k]
+        if fraction > 0.0:
+            now = now + fraction * (lag[2, k] - now)
+        lag[1, k] = now
+        lag[0, k] = now + decay * (value - before) - slope * (now - before)
+        for row in range(2, len(lag) - 1):
+            lag[row, k] = lag[row + 1, k]
+
+
+@njit
+def _write(row, numbers):
+    """Write numbers into a row."""
+    for k in range(len(numbers)):
+        row[k] = numbers[k]
+
+
+@njit
+def _three(row, first):
+    """Return three numbers of a row."""
+    return row[first], row[first + 1], row[first + 2]
+
+
+@njit
+def _six(row, first):
+    """Return six numbers of a row."""
+    return _three(row, first) + _three(row, first + 3)
+
+
+@njit
+def _carried(arm, frame, inside):
+    """Write where a frame of the flange is in the base."""
+    for k in range(3):
+        a, b, c = arm[FLANGE, 3 * k], arm[FLANGE, 3 * k + 1], arm[FLANGE, 3 * k + 2]
+        for n in range(3):
+            x, y, z = arm[inside, n], arm[inside, 3 + n], arm[inside, 6 + n]
+            arm[frame, 3 * k + n] = a * x + b * y + c * z
+        place = a * arm[inside, 9] + b * arm[inside, 10] + c * arm[inside, 11]
+        arm[frame, 9 + k] = arm[FLANGE, 9 + k] + place
+
+
+@njit(void(_ROWS, _ROWS, float64[::1], _6, _3, float64, boolean), cache=True)
+def follow(arm, lag, how, target, tremble_m, period_s, powered):
+    """Let the joints follow their target for a period; without power the brakes hold them where they are.
+
+    Parameters
+    ----------
+    arm : (ARM_ROWS, 12) array
+        Changed, but for the wrenches and what is set.
+    lag, how
+        See `behind`.
+    target : 6 floats
+        Angles of the joints at its end [rad].
+    tremble_m : 3 floats
+        Displacement of the tip in the base.
+    period_s : float
+    powered : bool
+    """
+    if powered:
+        _write(lag[len(lag) - 1], target)
+        behind(lag, how)
+    moving = False
+    for k in range(6):
+        arm[SPEEDS, 6 + k] = arm[SPEEDS, k] if powered else 0.0
+        arm[SPEEDS, k] = (lag[0, k] - arm[SEEN, k]) / period_s
+        arm[SEEN, k] = lag[0, k]
+        moving = moving or arm[SPEEDS, k] != 0.0
+    numbers = _posture(_six(arm[SEEN], 0))
+    _write(arm[FLANGE], numbers[:12])
+    _carried(arm, TOOL, TCP)
+    _carried(arm, TOUCH, TIP)
+    for k in range(3):
+        arm[TOUCH, 9 + k] += tremble_m[k]
+    for k in range(6):
+        arm[TWIST, k] = 0.0
+    if moving:
+        _write(arm[TWIST], _twist(numbers[12:], _three(arm[TOOL], 9), _six(arm[SPEEDS], 0)))
+
+
+@njit
+def _in_flange(flange, vector):
+    """Return a vector of the base as the flange sees it."""
+    x, y, z = vector
+    return (
+        flange[0] * x + flange[3] * y + flange[6] * z,
+        flange[1] * x + flange[4] * y + flange[7] * z,
+        flange[2] * x + flange[5] * y + flange[8] * z,
+    )
+
+
+@njit
+def _at_origin(place_m, force, torque):
+    """Return as a wrench about the origin what acts at a place."""
+    (x, y, z), (fx, fy, fz), (mx, my, mz) = place_m, force, torque
+    return fx, fy, fz, mx + (y * fz - z * fy), my + (z * fx - x * fz), mz + (x * fy - y * fx)
+
+
+@njit
+def _weight(masses, first, down):
+    """Return the weight of a mass as a wrench on the flange."""
+    kg = masses[first]
+    force = (down[0] * kg, down[1] * kg, down[2] * kg)
+    return _at_origin(_three(masses, first + 1), force, (0.0, 0.0, 0.0))
+
+
+@njit(float64(_ROWS, _6, _3, _3, boolean), cache=True)
+def feel(arm, error, force, torque, replaced):
+    """Measure the wrench on the flange; return the force on the TCP without payload and zero [N].
+
+    Parameters
+    ----------
+    arm : (ARM_ROWS, 12) array
+        Its wrenches are changed.
+    error : 6 floats
+        Of the sensor, in the flange [N], [N m].
+    force, torque : 3 floats
+        On the tip, in the base [N], [N m].
+    replaced : bool
+        Whether an external sensor's wrench is taken in place of the measured one.
+    """
+    flange, fall = arm[FLANGE], arm[FALL]
+    down = _in_flange(flange, _three(fall, 0))
+    tool, payload = _weight(arm[MASSES], 0, down), _weight(arm[MASSES], 4, down)
+    own = _weight(arm[MASSES], 8, down)
+    pressed = _at_origin(_three(arm[TIP], 9), _in_flange(flange, force), _in_flange(flange, torque))
+    told = _at_origin(_three(fall, 3), _three(fall, 6), _three(fall, 9))
+    for k in range(6):
+        measured = tool[k] + pressed[k] + error[k]
+        arm[WRENCHES, k] = measured
+        arm[WRENCHES, 6 + k] = (told[k] if replaced else measured) - (payload[k] - own[k])
+    (x, y, z), free, zero = _three(arm[TCP], 9), _six(arm[WRENCHES], 6), _six(arm[TWIST], 6)
+    fx, fy, fz = free[0] - zero[0], free[1] - zero[1], free[2] - zero[2]
+    mx = free[3] - zero[3] + (fy * z - fz * y)
+    my = free[4] - zero[4] + (fz * x - fx * z)
+    mz = free[5] - zero[5] + (fx * y - fy * x)
+    for k in range(3):
+        a, b, c = flange[3 * k], flange[3 * k + 1], flange[3 * k + 2]
+        arm[SEEN, 6 + k] = a * fx + b * fy + c * fz
+        arm[SEEN, 9 + k] = a * mx + b * my + c * mz
+    return math.sqrt(fx * fx + fy * fy + fz * fz)

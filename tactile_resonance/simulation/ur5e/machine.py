@@ -14,9 +14,10 @@ from typing import Protocol
 
 import numpy as np
 
-from tactile_resonance.contact.vectors import Vector, dot, rotated_back
+from tactile_resonance._typing import FloatArray
+from tactile_resonance.contact.vectors import Vector, dot
 from tactile_resonance.fields import AboveZero, Checked, NotNegative
-from tactile_resonance.simulation.noise import Jitter, Seed
+from tactile_resonance.simulation.noise import Jitter
 from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
     ForceMode,
@@ -24,9 +25,24 @@ from tactile_resonance.simulation.ur5e.forces import (
     FtSpecification,
     ToolPayload,
 )
-from tactile_resonance.simulation.ur5e.kinematics import Posture
+from tactile_resonance.simulation.ur5e.kinematics import (
+    ARM_ROWS,
+    FALL,
+    MASSES,
+    SEEN,
+    SPEEDS,
+    TCP,
+    TIP,
+    TOOL,
+    TOUCH,
+    TWIST,
+    WRENCHES,
+    Posture,
+    behind,
+    feel,
+    follow,
+)
 from tactile_resonance.simulation.ur5e.poses import (
-    IDENTITY,
     ORIGIN,
     ZERO,
     Six,
@@ -35,9 +51,7 @@ from tactile_resonance.simulation.ur5e.poses import (
     largest,
     pose_from_transform,
     rounded,
-    total,
     transform_from_pose,
-    wrench_about_origin,
 )
 from tactile_resonance.simulation.ur5e.target import (
     CYCLE_S,
@@ -78,89 +92,27 @@ class Lag:
 
     Attributes
     ----------
-    value : tuple of float
-        Where the axes are.
+    rows : (4 + n, axes) array
+        Where the axes are, and the set points that are on their way; see `behind`.
+    how : (3,) array
+        See `behind`.
     """
 
     def __init__(
         self, parameters: TrackingParameters, start: Sequence[float], period_s: float
     ) -> None:
-        self.value = tuple(start)
         periods = parameters.dead_time_s / period_s
         whole = int(periods + 1e-9)
-        self._fraction = max(0.0, periods - whole)
-        self._line: deque[Sequence[float]] = deque([self.value] * (whole + 2), maxlen=whole + 2)
-        self._delayed: Sequence[float] = self.value
+        self.rows = np.tile(np.array(start, dtype=float), (whole + 4, 1))
         lag = parameters.lag_s
-        self._decay = math.exp(-period_s / lag) if lag > 0 else 0.0
-        self._slope = lag / period_s * (1 - self._decay)
+        decay = math.exp(-period_s / lag) if lag > 0 else 0.0
+        self.how = np.array([max(0.0, periods - whole), decay, lag / period_s * (1 - decay)])
 
-    def step(self, target: Sequence[float]) -> tuple[float, ...]:
-        """Advance one period, at whose end the set points are `target`; return `value`."""
-        line, before, decay, slope = self._line, self._delayed, self._decay, self._slope
-        line.append(target)
-        now = line[1]
-        if self._fraction:
-            now = [b + self._fraction * (a - b) for a, b in zip(line[0], now, strict=True)]
-        if now is before and tuple(now) == self.value:  # at rest
-            return self.value
-        self._delayed = now
-        axes = zip(self.value, before, now, strict=True)
-        self.value = tuple([n + decay * (value - b) - slope * (n - b) for value, b, n in axes])
-        return self.value
-
-
-class Joints:
-    """Actual angles and speeds of the joints: dead time and lag behind the target.
-
-    Attributes
-    ----------
-    posture : Posture
-        At the angles that the encoders say [rad]; the same object while they do not change.
-    qd : 6 floats
-        Speeds [rad/s].
-    tremble_m : Vector
-        Vibration of the tool in the base, which the encoders do not see.
-    """
-
-    def __init__(self, q: Six, tracking: TrackingParameters, seed: Seed) -> None:
-        self._tracking = tracking
-        self._jitter = Jitter(tracking.jitter_rms_m, tracking.jitter_corner_rad_s, CYCLE_S, seed)
-        self.posture = Posture(q)
-        self.tremble_m: Vector = ORIGIN
-        self.hold()
-
-    @property
-    def q(self) -> Six:
-        """Angles [rad]."""
-        return self.posture.q
-
-    @property
-    def qdd(self) -> Six:
-        """Accelerations [rad/s^2]."""
-        return rate(self._slower, self.qd)
-
-    def reseed(self, seed: Seed) -> None:
-        """Let vibration follow from a seed, from the next step on."""
-        self._jitter.reseed(seed)
-
-    def step(self, target_q: Six, powered: bool) -> None:
-        """Follow for one cycle; without power the brakes hold the joints where they are."""
-        if not powered:
-            self._slower = self.qd = ZERO
-            return
-        before, self._slower = self.posture.q, self.qd
-        q = self._lag.step(target_q)
-        if q != before:
-            self.posture = Posture(q)
-        self.qd = ZERO if q == before else rate(before, q)
-        self.tremble_m = self._jitter.step()
-
-    def hold(self) -> Six:
-        """Forget what is pending and return the angles at which the brakes caught the joints."""
-        self._lag = Lag(self._tracking, self.q, CYCLE_S)
-        self._slower = self.qd = ZERO
-        return self.q
+    def step(self, target: Sequence[float]) -> FloatArray:
+        """Advance one period, at whose end the set points are `target`; return where the axes are, (axes,)."""
+        self.rows[-1] = target
+        behind(self.rows, self.how)
+        return self.rows[0].copy()
 
 
 # Cycles for which joint positions are remembered: one second.
@@ -224,7 +176,6 @@ class Machine:
     Attributes
     ----------
     target : Target
-    joints : Joints
     sensor : FtSensor
     force_mode : ForceMode
     payload : ToolPayload
@@ -236,8 +187,10 @@ class Machine:
         is on: what it weighs, part of the payload set, and where it measures in the flange.
     external_wrench : 6 floats
         RTDE input ``external_force_torque``.
-    tcp_force : 6 floats
-        Measured wrench on the TCP, along the axes of the base, payload and offset compensated.
+    tremble_m : Vector
+        Vibration of the tool in the base, which the encoders do not see.
+    pressed_n : float
+        Size of the measured force on the TCP, payload and offset compensated.
     """
 
     def __init__(
@@ -246,43 +199,82 @@ class Machine:
         self.config = config
         self.environment = environment
         self.target = Target(config.start_q, config.limits)
-        self.joints = Joints(config.start_q, config.tracking, int(random.integers(2**31)))
+        tracking, seed = config.tracking, int(random.integers(2**31))
+        self._jitter = Jitter(tracking.jitter_rms_m, tracking.jitter_corner_rad_s, CYCLE_S, seed)
+        self._lag = Lag(tracking, config.start_q, CYCLE_S)
         self.sensor = FtSensor(config.ft, random)
         self.force_mode = ForceMode(self.target)
         self.payload = config.tool
         self.gravity_m_s2: Vector = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)
         self.external: tuple[ToolPayload, Vector] | None = None
         self.external_wrench = ZERO
-        self.tcp_force = ZERO
-        self._tip = transform_from_pose(config.tip_in_flange)
-        self._posed = (IDENTITY, ZERO)  # of which TCP the pose was asked for last, and it
+        self.tremble_m: Vector = ORIGIN
+        self.pressed_n = 0.0
+        self._arm = np.zeros((ARM_ROWS, 12))
+        # parts of it that are read in each cycle
+        self._q, self._wrench = self._arm[SEEN, :6], self._arm[SEEN, 6:]
+        self._qd, self._twist = self._arm[SPEEDS, :6], self._arm[TWIST, :6]
+        self._raw, self._seen = self._arm[WRENCHES, :6], self._arm[SEEN]
+        self._q[:] = config.start_q
+        turn, place = transform_from_pose(config.tip_in_flange)
+        self._arm[TIP] = *turn, *place
+        self._set: tuple = ()  # what of the program's settings stands in the arm's state
+        # TCP of which the pose was told last, and it
+        self._posed: tuple[list[float], Six] = ([], ZERO)
         self._rest_cycles = 0
-        self._history: deque[tuple[Six, Six]] = deque(maxlen=HISTORY)
+        # joint angles and wrench on the TCP, (12,)
+        self._history: deque[FloatArray] = deque(maxlen=HISTORY)
+        self._follow(False)
         self._observe()
+
+    @property
+    def q(self) -> Six:
+        """Angles that the joints' encoders say [rad]."""
+        return tuple(self._q.tolist())
+
+    @property
+    def qd(self) -> Six:
+        """Speeds of the joints [rad/s]."""
+        return tuple(self._qd.tolist())
+
+    @property
+    def qdd(self) -> Six:
+        """Accelerations of the joints [rad/s^2]."""
+        return rate(tuple(self._arm[SPEEDS, 6:].tolist()), self.qd)
 
     @property
     def posture(self) -> Posture:
         """Actual posture of the arm."""
-        return self.joints.posture
+        return Posture(self.q)
 
     @property
     def tcp(self) -> Transform:
         """Actual TCP in the base."""
-        return self.posture.tool(self.target.tcp)
+        *turn, x, y, z = self._arm[TOOL].tolist()
+        return tuple(turn), (x, y, z)
 
     @property
     def tcp_pose(self) -> Six:
         """Its pose."""
-        if self._posed[0] is not self.tcp:  # an arm at rest has the same one
-            self._posed = self.tcp, pose_from_transform(self.tcp)
+        numbers = self._arm[TOOL].tolist()
+        if self._posed[0] != numbers:  # that of an arm at rest stays
+            self._posed = numbers, pose_from_transform(self.tcp)
         return self._posed[1]
 
     @property
     def tcp_twist(self) -> Six:
         """Actual twist of the TCP in the base [m/s, rad/s]."""
-        if self.joints.qd is ZERO:
-            return ZERO
-        return self.posture.twist(self.tcp[1], self.joints.qd)
+        return tuple(self._twist.tolist())
+
+    @property
+    def tcp_force(self) -> Six:
+        """Measured wrench on the TCP, along the axes of the base, payload and offset compensated."""
+        return tuple(self._wrench.tolist())
+
+    @property
+    def raw_wrench(self) -> Six:
+        """Measured at the flange, in its frame, nothing compensated (``ft_raw_wrench``)."""
+        return tuple(self._raw.tolist())
 
     @property
     def outer_torque(self) -> Six:
@@ -303,24 +295,32 @@ class Machine:
 
     def reseed(self, random: np.random.Generator) -> None:
         """Take vibration and noise of the sensor from a generator, from the next step on."""
-        self.joints.reseed(int(random.integers(2**31)))
+        self._jitter.reseed(int(random.integers(2**31)))
         self.sensor.reseed(random)
 
     def step(self, powered: bool) -> None:
         """Follow the target for one cycle and feel what the tool touches."""
         self.target.end_cycle()
-        self.joints.step(self.target.q, powered)
+        if powered:
+            self.tremble_m = self._jitter.step()
+        self._follow(powered)
         self._rest_cycles = 0 if any(self.target.qd) else self._rest_cycles + 1
         self._observe()
+
+    def zero_sensor(self) -> None:
+        """Take the wrench without payload as zero (``zero_ftsensor``)."""
+        self._arm[TWIST, 6:] = self._arm[WRENCHES, 6:]
 
     def catch_with_brakes(self) -> None:
         """Take the place where the brakes hold the joints as the target."""
         self.force_mode.end()
-        self.target.hold(self.joints.hold())
+        self._lag = Lag(self.config.tracking, self.q, CYCLE_S)
+        self._arm[SPEEDS] = self._arm[TWIST, :6] = 0.0
+        self.target.hold(self.q)
 
     def solve(self, tool: Transform, q_near: Six | None = None) -> Six | None:
         """Return joint angles that bring the TCP to a place in the base; None out of reach."""
-        return self.target.solve(tool, self.joints.q if q_near is None else q_near)
+        return self.target.solve(tool, self.q if q_near is None else q_near)
 
     def solved(self, tool: Transform, q_near: Six | None = None) -> Six:
         """Return joint angles as `solve`; raises ScriptError out of reach."""
@@ -348,7 +348,7 @@ class Machine:
                 f"get_actual_joint_positions_history: steps {steps}; accepted is 0 to "
                 f"{len(self._history) - 1}"
             )
-        return self._history[-1 - steps][0]
+        return tuple(self._history[-1 - steps][:6].tolist())
 
     def contact_steps(self, direction: Vector) -> int:
         """Return how many cycles ago the tool began to press along a direction; 0 without contact.
@@ -361,43 +361,39 @@ class Machine:
         length = math.hypot(*direction)
         threshold = self.config.contact_force_n
 
-        def pressing(wrench: Six) -> float:
-            x, y, z = wrench[:3]
+        def pressing(seen: FloatArray) -> float:
+            x, y, z = seen[6:9].tolist()
             return math.hypot(x, y, z) if length == 0.0 else -dot((x, y, z), direction) / length
 
-        if pressing(self.tcp_force) < threshold:
+        if pressing(self._seen) < threshold:
             return 0
         steps = 0
-        for _, wrench in reversed(self._history):
-            if pressing(wrench) < threshold / 3:
+        for seen in reversed(self._history):
+            if pressing(seen) < threshold / 3:
                 break
             steps += 1
         return min(max(1, steps), len(self._history) - 1)
 
+    def _follow(self, powered: bool) -> None:
+        """Let the joints follow for one cycle, where the brakes do not hold them."""
+        lag, tcp = self._lag, self.target.tcp
+        wanted = (tcp, self.payload, self.gravity_m_s2, self.external, self.external_wrench)
+        if wanted != self._set:
+            own, own_m = self.external or (ToolPayload(), ORIGIN)
+            self._arm[TCP] = *tcp[0], *tcp[1]
+            masses = [(mass.mass_kg, *mass.cog_m) for mass in (self.config.tool, self.payload, own)]
+            self._arm[MASSES] = np.ravel(masses)
+            self._arm[FALL] = *self.gravity_m_s2, *own_m, *self.external_wrench
+            self._set = wanted
+        follow(self._arm, lag.rows, lag.how, self.target.q, self.tremble_m, CYCLE_S, powered)
+
     def _observe(self) -> None:
         """Touch what is there with the tip and measure the wrench at the flange."""
-        turn = self.posture.flange[0]
-        wrench = self.config.tool.weight(turn, self.gravity_m_s2)
+        force = torque = ORIGIN
         if self.environment is not None:
-            wrench = total(wrench, self._touch(self.environment))
-        weight = self.payload.weight(turn, self.gravity_m_s2)
-        measured = None
-        if self.external is not None:
-            own, place_m = self.external
-            weight = difference(weight, own.weight(turn, self.gravity_m_s2))
-            fx, fy, fz, tx, ty, tz = self.external_wrench
-            measured = wrench_about_origin(place_m, (fx, fy, fz), (tx, ty, tz))
-        self.sensor.step(wrench, weight, measured)
-        self.tcp_force = self.sensor.at_tcp(turn, self.target.tcp[1])
-        self._history.append((self.posture.q, self.tcp_force))
-
-    def _touch(self, environment: Environment) -> Six:
-        """Move the tip; return the wrench of what it touches on the flange, in the flange's frame."""
-        turn, (x, y, z) = self.posture.tool(self._tip)
-        dx, dy, dz = self.joints.tremble_m
-        environment.step((turn, (x + dx, y + dy, z + dz)), CYCLE_S)
-        if environment.force_n == ORIGIN == environment.torque_nm:
-            return ZERO
-        flange = self.posture.flange[0]
-        force = rotated_back(flange, environment.force_n)
-        return wrench_about_origin(self._tip[1], force, rotated_back(flange, environment.torque_nm))
+            *turn, x, y, z = self._arm[TOUCH].tolist()
+            self.environment.step((tuple(turn), (x, y, z)), CYCLE_S)
+            force, torque = self.environment.force_n, self.environment.torque_nm
+        replaced = self.external is not None
+        self.pressed_n = feel(self._arm, self.sensor.error(), force, torque, replaced)
+        self._history.append(self._seen.copy())

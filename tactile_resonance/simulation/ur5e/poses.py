@@ -10,7 +10,6 @@ from tactile_resonance.contact.vectors import (
     NO_TURN,
     Turn,
     Vector,
-    cross,
     dot,
     rotated_back,
     transposed,
@@ -83,9 +82,3 @@ def turned(transform: Transform, shift_m: Vector, turn_rad: Vector) -> Transform
 def turn_between(start: Transform, end: Transform) -> Vector:
     """Return the rotation vector in the base [rad] that turns one transform into another."""
     return vector_from_turn(turn_product(end[0], transposed(start[0])))
-
-
-def wrench_about_origin(place_m: Vector, force: Vector, torque: Vector) -> Six:
-    """Return as a wrench about the origin what acts at a place: a force [N] and a torque [N m]."""
-    x, y, z = cross(place_m, force)
-    return *force, torque[0] + x, torque[1] + y, torque[2] + z

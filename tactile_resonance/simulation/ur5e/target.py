@@ -77,8 +77,8 @@ class Target:
 
     Attributes
     ----------
-    posture : Posture
-        At the target angles [rad].
+    q : 6 floats
+        Target angles [rad].
     qd : 6 floats
         Target speeds [rad/s].
     pace : float
@@ -98,7 +98,7 @@ class Target:
         self.limits = limits
         self._tcp = self._flange_in_tcp = IDENTITY
         self.pace = 1.0
-        self.posture = Posture(q)
+        self.q, self._posture = q, Posture(q)
         self.qd = ZERO
         self._cycle_qd = ZERO
         self._accelerated: tuple[Six, Six] = (ZERO, ZERO)  # from and to, in the last whole cycle
@@ -118,9 +118,11 @@ class Target:
         self._tcp, self._flange_in_tcp = value, inverse_transform(value)
 
     @property
-    def q(self) -> Six:
-        """Target angles [rad]."""
-        return self.posture.q
+    def posture(self) -> Posture:
+        """At the target angles; computed where somebody asks for it."""
+        if self._posture.q is not self.q:
+            self._posture = Posture(self.q)
+        return self._posture
 
     @property
     def qdd(self) -> Six:
@@ -160,8 +162,8 @@ class Target:
             self.brake(self.limits.brake_rad_s2)
         self._accelerated = self._cycle_qd, self.qd
 
-    def command(self, q: Six, qd: Six) -> None:
-        """Set target angles and speeds for this cycle.
+    def command(self, q: Six, qd: Six, *, within: bool = False) -> None:
+        """Set target angles and speeds for this cycle; those known to be `within` all limits are not looked at.
 
         Raises
         ------
@@ -170,11 +172,16 @@ class Target:
         ProtectiveStop
             Where a joint would pass its range or its speed, as near a singularity.
         """
-        self._command(Posture(q), qd)
+        if not within and not math.isfinite(sum(qd)):
+            raise ProtectiveStop("the path leads through a singularity")
+        self._require_turn()
+        if not within:
+            self._check(q, qd)
+        self.commanded, self.q, self.qd = True, q, qd
 
     def command_tool(self, tool: Transform, twist: Six) -> None:
         """Set the target TCP and its twist for this cycle; raises as `command`."""
-        self._command(*self._motion_to(tool, twist))
+        self.command(*self._motion_to(tool, twist))
 
     def command_towards(self, goal: Six, acceleration: float, *, straight: bool) -> bool:
         """Bring the target twist nearer to a goal in this cycle, and say whether it is there.
@@ -184,10 +191,13 @@ class Target:
         """
         numbers = motion_towards(
             *(self.q, self.qd, goal, acceleration * CYCLE_S, CYCLE_S, straight),
-            *(self.limits.joint_range_rad, *self._tcp, *self._flange_in_tcp),
+            *(self.limits.joint_range_rad, self.limits.joint_speed_rad_s),
+            *(*self._tcp, *self._flange_in_tcp),
         )
-        self._command(*_motion(numbers, self.tool))
-        return numbers[-1] > 0
+        if numbers[12] == math.inf:
+            raise _out_of_reach(self.tool)
+        self.command(numbers[:6], numbers[6:12], within=numbers[14] > 0)
+        return numbers[13] > 0
 
     def stay(self) -> None:
         """Stand still in this cycle, where the arm stands already; raises as `command`."""
@@ -198,14 +208,14 @@ class Target:
         """Move the target TCP aside by a compliance, beside what the program commands."""
         before = self.tool
         aside = turned(before, shift_m, turn_rad)
-        posture, _ = self._motion_to(aside, ZERO)
-        self._check(posture)
-        self.yielded_q = total(self.yielded_q, difference(posture.q, self.q))
+        q, _ = self._motion_to(aside, ZERO)
+        self._check(q)
+        self.yielded_q = total(self.yielded_q, difference(q, self.q))
         x, y, z = self.yielded_m
         self.yielded_m = (x + shift_m[0], y + shift_m[1], z + shift_m[2])
         turn = turn_product(aside[0], transposed(before[0]))
         self.yielded_turn = turn_product(turn, self.yielded_turn)
-        self.posture = posture
+        self.q = q
 
     def brake(self, deceleration_rad_s2: float) -> None:
         """Brake by one cycle, all joints in proportion."""
@@ -214,41 +224,37 @@ class Target:
         share = max(0.0, 1.0 - deceleration_rad_s2 * CYCLE_S / largest(self.qd))
         limit, way_s = self.limits.joint_range_rad, (1 + share) / 2 * CYCLE_S
         reached = [q + qd * way_s for q, qd in zip(self.q, self.qd, strict=True)]
-        self.posture = Posture(tuple([max(-limit, min(limit, q)) for q in reached]))
+        self.q = tuple([max(-limit, min(limit, q)) for q in reached])
         self.qd = tuple([qd * share for qd in self.qd])
 
     def hold(self, q: Six) -> None:
         """Stand still at joint angles."""
-        self.posture, self.qd = Posture(q), ZERO
+        self.q, self.qd = q, ZERO
 
     def solve(self, tool: Transform, q_near: Six) -> Six | None:
         """Return the joint angles for a TCP in the base, nearest to `q_near`; None out of reach."""
         flange = product(tool, self._flange_in_tcp)
         return nearest_inverse(flange, q_near, self.limits.joint_range_rad)
 
-    def _motion_to(self, tool: Transform, twist: Six) -> tuple[Posture, Six]:
-        """Return posture and speeds of the joints for a TCP in the base, nearest to the present ones."""
+    def _motion_to(self, tool: Transform, twist: Six) -> tuple[Six, Six]:
+        """Return angles and speeds of the joints for a TCP in the base, nearest to the present ones."""
         near = self.q, self.limits.joint_range_rad
-        return _motion(motion_to(*tool, twist, *near, *self._tcp, *self._flange_in_tcp), tool)
-
-    def _command(self, posture: Posture, qd: Six) -> None:
-        if not math.isfinite(sum(qd)):
-            raise ProtectiveStop("the path leads through a singularity")
-        self._require_turn()
-        self._check(posture, qd)
-        self.commanded, self.posture, self.qd = True, posture, qd
+        numbers = motion_to(*tool, twist, *near, *self._tcp, *self._flange_in_tcp)
+        if numbers[12] == math.inf:
+            raise _out_of_reach(tool)
+        return numbers[:6], numbers[6:12]
 
     def _require_turn(self) -> None:
         if self.commanded:
             raise ScriptError("another thread is already controlling the robot")
 
-    def _check(self, posture: Posture, qd: Six = ZERO) -> None:
-        """Refuse a posture out of limits, and speeds: those given and those with which it is reached."""
+    def _check(self, q: Six, qd: Six = ZERO) -> None:
+        """Refuse angles out of limits, and speeds: those given and those with which it is reached."""
         limits = self.limits
-        reached = largest(posture.q)
+        reached = largest(q)
         if reached > limits.joint_range_rad:
             raise ProtectiveStop(f"a joint would reach {reached:.3f} rad, beyond its range")
-        for speeds in (qd, rate(self.posture.q, posture.q)):
+        for speeds in (qd, rate(self.q, q)):
             fastest = largest(speeds)
             # rounding of a finite difference must not stop a joint that moves at its limit
             if fastest > limits.joint_speed_rad_s * (1 + 1e-6):
@@ -259,11 +265,8 @@ class Target:
                 )
 
 
-def _motion(numbers: tuple[float, ...], tool: Transform) -> tuple[Posture, Six]:
-    """Return what `motion_to` found for a place of the TCP, or near it."""
-    if numbers[36] == math.inf:
-        raise ProtectiveStop(f"no joint angles reach the position {rounded(tool[1])} m")
-    return Posture(numbers[:6], numbers[6:30]), numbers[30:36]
+def _out_of_reach(tool: Transform) -> ProtectiveStop:
+    return ProtectiveStop(f"no joint angles reach the position {rounded(tool[1])} m")
 
 
 def rate(before: Six, now: Six) -> Six:

@@ -9,15 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from tactile_resonance.contact.vectors import NO_TURN
 from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
     FtSensor,
     FtSpecification,
     ToolPayload,
 )
-from tactile_resonance.simulation.ur5e.machine import MachineConfig
-from tactile_resonance.simulation.ur5e.poses import ORIGIN, ZERO, wrench_about_origin
+from tactile_resonance.simulation.ur5e.kinematics import _at_origin
+from tactile_resonance.simulation.ur5e.machine import MachineConfig, TrackingParameters
 
 sys.path.insert(0, str(Path(__file__).parent))
 from matrices import floats
@@ -37,8 +36,7 @@ def test_offset_and_repeatability_follow_the_data_sheet_as_read():
     first = []
     for seed in range(400):
         sensor = FtSensor(specification, np.random.default_rng(seed))
-        sensor.step(ZERO, ZERO)
-        first.append(sensor.raw)
+        first.append(sensor.error())
     # accuracy 4.0 N, 0.3 N m and precision 3.5 N, 0.2 N m at two standard deviations
     total = np.hypot([2.0] * 3 + [0.15] * 3, [1.75] * 3 + [0.1] * 3)
     assert_deviation(np.array(first), total)
@@ -46,25 +44,22 @@ def test_offset_and_repeatability_follow_the_data_sheet_as_read():
 
 def test_noise_is_white_beside_a_slow_drift():
     sensor = FtSensor(FtSpecification(), np.random.default_rng(11))
-    samples = []
-    for _ in range(4001):
-        sensor.step(ZERO, ZERO)
-        samples.append(sensor.raw)
+    samples = [sensor.error() for _ in range(4001)]
     # differences of disjoint pairs: twice the white variance, the drift of 2 ms is negligible
     pairs = np.diff(np.array(samples), axis=0)[::2]
     white = np.array([1.75] * 3 + [0.1] * 3) * np.sqrt(0.5)
     assert_deviation(pairs, white * np.sqrt(2))
 
 
-def test_zeroing_takes_the_offset_and_leaves_the_noise():
-    sensor = FtSensor(FtSpecification(), np.random.default_rng(5))
-    for _ in range(10):
-        sensor.step(ZERO, ZERO)
-    sensor.zero()
+def test_zeroing_takes_the_offset_and_leaves_the_noise(make_client):
+    still = TrackingParameters(jitter_rms_m=0.0)
+    client = make_client(machine=MachineConfig(tracking=still), seed=5)
+    client.run(0.02)
+    client.call(8)
     readings = []
     for _ in range(2000):
-        sensor.step(ZERO, ZERO)
-        readings.append(sensor.at_tcp(NO_TURN, ORIGIN))
+        client.controller.step()
+        readings.append(client.output("actual_TCP_force"))
     # the zero itself is one noisy sample; within 4 s the drift is a quarter of its variance at most
     white = np.array([1.75] * 3 + [0.1] * 3) * np.sqrt(0.5)
     assert np.all(np.abs(np.mean(readings, axis=0)) < 5 * white)
@@ -76,7 +71,7 @@ def test_a_wrench_about_another_point_does_the_same_work():
     wrench, twist = rng.standard_normal((2, 6))
     place = rng.standard_normal(3)
     moved_twist = [*(twist[:3] - np.cross(twist[3:], place)), *twist[3:]]
-    moved = wrench_about_origin(floats(place), floats(wrench[:3]), floats(wrench[3:]))
+    moved = _at_origin(floats(place), floats(wrench[:3]), floats(wrench[3:]))
     assert np.dot(moved, moved_twist) == pytest.approx(wrench @ twist)
 
 

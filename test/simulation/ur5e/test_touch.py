@@ -163,7 +163,7 @@ def test_the_tip_trembles_where_the_encoders_stand_still(make_client, plant):
     heights = []
     for _ in range(3000):
         client.controller.step()
-        heights.append(client.controller.machine.joints.tremble_m[2])
+        heights.append(client.controller.machine.tremble_m[2])
     assert np.array_equal(client.output("actual_q"), q)
     # 3 micrometres rms over 6 s, some hundred correlation times
     assert np.std(heights) == pytest.approx(3e-6, rel=0.25)
