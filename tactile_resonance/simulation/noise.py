@@ -34,14 +34,15 @@ class NormalRows:
     def __init__(self, seed: Seed, rms: Sequence[float]) -> None:
         self._random = np.random.default_rng(seed)
         self._rms = np.array(rms)  # (width,)
-        self._left: list[FloatArray] = []  # the next row last
+        self._left = np.empty((0, self._rms.size))
 
-    def take(self) -> FloatArray:
-        """Return the next row, (width,)."""
-        if not self._left:
-            numbers = self._rms * self._random.standard_normal((ROWS, self._rms.size))
-            self._left = [*reversed(numbers)]
-        return self._left.pop()
+    def take(self, count: int) -> FloatArray:
+        """Return the next rows, (count, width)."""
+        while len(self._left) < count:
+            drawn = self._rms * self._random.standard_normal((ROWS, self._rms.size))
+            self._left = np.concatenate([self._left, drawn])
+        rows, self._left = self._left[:count], self._left[count:]
+        return rows
 
 
 class Jitter:

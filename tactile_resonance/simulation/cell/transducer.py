@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64, from_dtype, int64, njit
+from numba import boolean, float64, from_dtype, int64, njit, uint8, void
 from numba.types import UniTuple
+from numpy.typing import NDArray
 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.fields import AboveZero, Checked, NotNegative, read_file, require
@@ -32,6 +33,10 @@ Counts = tuple[int, ...]
 SAMPLE_PERIOD_S = 0.001
 """The cell converts at 1 kHz, the fastest rate that it can send."""
 LARGEST_COUNT = 32767
+START = 0x0B
+"""Command of the stream, which its responses repeat."""
+RESPONSE_BYTES, WRENCH = 16, struct.Struct(">B6hB")
+"""Of a response, and what it has of a wrench: command, six counts, overload bits."""
 NO_NUMBER = -32768
 """The count of a converter that has no result."""
 
@@ -125,41 +130,46 @@ AXES = np.dtype(
 
 
 @njit(
-    UniTuple(int64, 7)(
-        *(from_dtype(AXES)[::1], *[UniTuple(float64, 6)] * 2, float64, float64[::1]),
-        *(*[float64] * 3, boolean, float64, boolean),
+    void(
+        *(from_dtype(AXES)[::1], uint8[:, ::1], float64[:, ::1], *[UniTuple(float64, 6)] * 2),
+        *(*[float64] * 3, *[boolean] * 3, float64, boolean, int64),
     ),
     cache=True,
 )
 def _convert(
-    axes, before, load, part, noise, keep, signal_keep, noise_keep, flipped, bias_step_n, stuck
-):
+    axes, responses, noise, load, before,
+    start_s, span_s, keep, has_signal, has_noise, flipped, bias_step_n, stuck, z_count,
+):  # fmt: skip
     """See `Transducer.convert`; behind the low-pass noise begins anywhere in its stationary state."""
-    bits = 0
-    for k in range(6):
-        axis, now = axes[k], before[k] + part * (load[k] - before[k])
-        axis.offset += axis.drift
-        signal = now + axis.offset
-        if flipped:  # the bias turns with the sign too
-            signal = -signal
-        if k == 2:
-            signal += bias_step_n
-        if noise_keep < 0.0:
-            axis.noise = math.sqrt((1 - keep) / (1 + keep)) * noise[k]
-        else:
-            axis.noise = noise_keep * axis.noise + (1 - noise_keep) * noise[k]
-        axis.signal = signal_keep * axis.signal + (1 - signal_keep) * signal
-        if not stuck:
-            count = (axis.signal + axis.noise - axis.zero) * axis.divisor
-            axis.count = int(np.rint(max(-LARGEST_COUNT, min(LARGEST_COUNT, count))))
-        over = abs(now) > axis.range
-        axis.overloads += over and not axis.overloaded
-        axis.overloaded = over
-        bits = bits << 1 | over
-    return (
-        *(axes[0].count, axes[1].count, axes[2].count, axes[3].count, axes[4].count),
-        *(axes[5].count, bits),
-    )
+    time_s = start_s
+    for row in range(len(responses)):
+        time_s += SAMPLE_PERIOD_S
+        part, bits = (time_s - start_s) / span_s, 0
+        signal_keep = keep if has_signal else 0.0
+        for k in range(6):
+            axis, now = axes[k], before[k] + part * (load[k] - before[k])
+            axis.offset += axis.drift
+            signal = now + axis.offset
+            if flipped:  # the bias turns with the sign too
+                signal = -signal
+            if k == 2:
+                signal += bias_step_n
+            if has_noise:
+                axis.noise = keep * axis.noise + (1 - keep) * noise[row, k]
+            else:
+                axis.noise = math.sqrt((1 - keep) / (1 + keep)) * noise[row, k]
+            axis.signal = signal_keep * axis.signal + (1 - signal_keep) * signal
+            if not stuck:
+                count = (axis.signal + axis.noise - axis.zero) * axis.divisor
+                axis.count = int(np.rint(max(-LARGEST_COUNT, min(LARGEST_COUNT, count))))
+            told = z_count if z_count != 0 and k == 2 else axis.count
+            responses[row, 1 + 2 * k], responses[row, 2 + 2 * k] = told >> 8 & 255, told & 255
+            over = abs(now) > axis.range
+            axis.overloads += over and not axis.overloaded
+            axis.overloaded = over
+            bits = bits << 1 | over
+        responses[row, 0], responses[row, 13] = START, bits
+        has_signal = has_noise = True
 
 
 class Transducer:
@@ -191,7 +201,7 @@ class Transducer:
         self._axes["divisor"] = [p.force_divisor] * 3 + [p.torque_divisor] * 3
         self._axes["drift"] = [p.force_drift_n_per_s * period_s] * 3 + [0.0] * 3
         self._axes["offset"] = [*p.force_bias_n, *p.torque_bias_nm]
-        self._read = False  # whether there is a reading
+        self._read = self._noisy = False  # whether there is a reading, and noise in the filter
         self._period_s, self._keep = period_s, 0.0  # of the low-pass, off
         self.reseed(seed)
 
@@ -202,42 +212,53 @@ class Transducer:
     def reseed(self, seed: Seed) -> None:
         """Take all noise from the next conversion on from a seed, that in the filter's memory too."""
         self._rows = NormalRows(seed, self._noise_rms)
-        self._noise_begins = True
+        self._noisy = False
 
     def set_zero(self, on: bool) -> None:
         """Take the present reading as zero, or end that."""
         self._axes["zero"] = self._axes["signal"] + self._axes["noise"] if on else 0.0
 
-    def convert(self, load: Six, before: Six | None = None, part: float = 1.0) -> Counts:
-        """Convert once: from the wrench on the cell, 6 [N, N m], to six counts and, last, overload bits.
-
-        Bit 5 belongs to Fx, bit 0 to Tz.
+    def convert(
+        self, load: Six, before: Six, start_s: float, span_s: float, count: int
+    ) -> NDArray[np.uint8]:
+        """Convert some times, once a period.
 
         Parameters
         ----------
         load, before : 6 floats
-            At the end of some time, and where that is not all of it at its beginning.
-        part : float
-            Of that time that is over.
+            Wrench on the cell at the end and at the beginning of some time [N, N m].
+        start_s, span_s : float
+            When that time begins, with the conversion before, and how long it is.
+        count : int
+
+        Returns
+        -------
+        (count, 16) array
+            Responses of the stream: counts of the six axes from the second byte on, big-endian, then overload
+            bits, of which bit 5 belongs to Fx, bit 0 to Tz.
         """
-        faults, keep = self.faults, self._keep
-        signal_keep = keep if self._read else 0.0
-        noise_keep = -1.0 if self._noise_begins else keep
-        self._read, self._noise_begins = True, False
-        converted: Counts = _convert(
-            *(self._axes, load if before is None else before, load, part, self._rows.take()),
-            *(keep, signal_keep, noise_keep, faults.flipped, faults.bias_step_n, faults.stuck),
-        )
+        faults, z_count = self.faults, 0
         if faults.saturated or faults.invalid:
-            z = NO_NUMBER if faults.invalid else LARGEST_COUNT
-            return *converted[:2], z, *converted[3:]
-        return converted
+            z_count = NO_NUMBER if faults.invalid else LARGEST_COUNT
+        responses = np.zeros((count, RESPONSE_BYTES), np.uint8)
+        _convert(
+            *(self._axes, responses, self._rows.take(count), load, before, start_s, span_s),
+            *(self._keep, self._read, self._noisy, faults.flipped, faults.bias_step_n, faults.stuck),
+            z_count,
+        )
+        self._read = self._noisy = True
+        return responses
+
+    def convert_once(self, load: Six) -> Counts:
+        """Convert once: from the wrench on the cell, 6 [N, N m], to six counts and, last, overload bits."""
+        response = self.convert(load, load, 0.0, SAMPLE_PERIOD_S, 1)
+        return WRENCH.unpack_from(response.tobytes())[1:]
 
 
 READ_MODEL, READ_SERIAL, READ_FIRMWARE = 0x01, 0x02, 0x03
 SET_IDS, READ_IDS = 0x04, 0x05
 SET_FILTER, READ_FILTER = 0x08, 0x09
-READ_ONCE, START, STOP = 0x0A, 0x0B, 0x0C
+READ_ONCE, STOP = 0x0A, 0x0C
 SET_RATE, READ_RATE = 0x0F, 0x10
 SET_BIAS, READ_OVERLOADS = 0x11, 0x12
 
@@ -259,7 +280,6 @@ class CanFrame(NamedTuple):
 
 COMMAND_ID, RESPONSE_IDS = 0x64, (0x001, 0x002)
 """Identifiers of the frames that it takes, and of those that it sends."""
-_WRENCH = struct.Struct(">B6hB")
 
 
 class LoadCell(Transducer):
@@ -278,7 +298,7 @@ class LoadCell(Transducer):
         self._time_s: float | None = None
         self._ticks = self._sent = 0
         self._wrench: tuple[float, ...] = (0.0,) * 6
-        self._counts: Counts = (0,) * 7
+        self._response = bytes(RESPONSE_BYTES)  # its command is that of the stream
 
     def step(self, wrench: Iterable[float], time_s: float) -> list[CanFrame]:
         """Advance to a time of the plant, at which `wrench`, 6 [N, N m], acts on the cell.
@@ -295,13 +315,18 @@ class LoadCell(Transducer):
             self._time_s, self._wrench = time_s, load
         before, start_s, span_s = self._wrench, self._time_s, time_s - self._time_s
         frames: list[CanFrame] = []
+        times_s = []
         while self._time_s + SAMPLE_PERIOD_S <= time_s + 1e-9:
             self._time_s += SAMPLE_PERIOD_S
-            part = (self._time_s - start_s) / span_s
-            self._counts = self.convert(load, before, part)
+            times_s.append(self._time_s)
+        if times_s:
+            told = self.convert(load, before, start_s, span_s, len(times_s)).tobytes()
+            self._response = told[-RESPONSE_BYTES:]
+        for number, told_s in enumerate(times_s):
             self._ticks += 1
             if self.streaming and self._ticks % DECIMATIONS[self._rate_code] == 0:
-                frames += self._wrench_frames(START)
+                first = number * RESPONSE_BYTES
+                frames += self._wrench_frames(told[first : first + RESPONSE_BYTES], told_s)
         if load != before:
             # what is left of the span counts for the next call
             left = (time_s - self._time_s) / span_s if span_s > 0 else 0.0
@@ -327,8 +352,9 @@ class LoadCell(Transducer):
             self.set_zero(bool(parameters[0]))
             return []
         if command == READ_ONCE:
-            return self._wrench_frames(READ_ONCE)
-        return self._frames(bytes([command, *self._answer(command, parameters)]))
+            return self._wrench_frames(bytes([READ_ONCE]) + self._response[1:], self._time_s or 0.0)
+        answer = bytes([command, *self._answer(command, parameters)])
+        return self._frames(answer.ljust(RESPONSE_BYTES, b"\0"), self._time_s or 0.0)
 
     def _answer(self, command: int, parameters: list[int]) -> bytes:
         """D2 onwards."""
@@ -362,17 +388,17 @@ class LoadCell(Transducer):
             return bytes(min(255, count) for count in self._axes["overloads"].tolist())
         return bytes([0, UNSUPPORTED])
 
-    def _wrench_frames(self, command: int) -> list[CanFrame]:
+    def _wrench_frames(self, response: bytes, time_s: float) -> list[CanFrame]:
         if self.faults.silent:
             return []
         self._sent += 1
-        frames = self._frames(_WRENCH.pack(command, *self._counts))
+        frames = self._frames(response, time_s)
         every = self.faults.lose_second_every
         return frames[:1] if every and self._sent % every == 0 else frames
 
-    def _frames(self, response: bytes) -> list[CanFrame]:
-        (first, second), whole, time_s = RESPONSE_IDS, response.ljust(16, b"\0"), self._time_s or 0.0
-        return [CanFrame(time_s, first, whole[:8]), CanFrame(time_s, second, whole[8:])]
+    def _frames(self, response: bytes, time_s: float) -> list[CanFrame]:
+        first, second = RESPONSE_IDS
+        return [CanFrame(time_s, first, response[:8]), CanFrame(time_s, second, response[8:])]
 
 
 def _result(good: bool) -> bytes:

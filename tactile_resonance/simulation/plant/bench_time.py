@@ -85,6 +85,8 @@ class BenchTime:
     at_once : callable
         On the wall clock: how many steps may be made together, when the last of them is due, because nobody
         needs each of them at its time.
+    to_follow : int
+        In a step: how many are made together with it, after it.
     """
 
     def __init__(self, reactor: Reactor, step_ns: int, *, simulated: bool) -> None:
@@ -97,6 +99,7 @@ class BenchTime:
         self.frames_sent: Callable[[int], int] = lambda port: 0
         self.packets_arrived: Callable[[], int | None] = lambda: None
         self.at_once: Callable[[], int] = lambda: 1
+        self.to_follow = 0
         self.stalls, self.longest_delay_s = 0, 0.0
         self.simulated = simulated
         self._reactor, self._step_ns = reactor, step_ns
@@ -234,10 +237,7 @@ class BenchTime:
             if self.demand() is None:
                 continue
             due_ns = self._next_due(due_ns, time.perf_counter_ns())
-            self._reactor.gathers = steps > 1
-            for _ in range(steps):
-                self._step()
-            self._reactor.gathers = False
+            self.steps_together(steps)
             steps = 1 if self.simulated else self.at_once()
             due_ns += (steps - 1) * self._step_ns
             repeat_ns = time.perf_counter_ns() + round(REPEAT_S * 1e9)
@@ -251,6 +251,13 @@ class BenchTime:
             return False
         self._packets_mark, self._packets_due = -1, 0
         return True
+
+    def steps_together(self, count: int) -> None:
+        """Make some steps; what is sent in them goes out together."""
+        self._reactor.gathers = count > 1
+        for self.to_follow in reversed(range(count)):
+            self._step()
+        self._reactor.gathers = False
 
     def _step(self) -> None:
         self.now_ns += self._step_ns

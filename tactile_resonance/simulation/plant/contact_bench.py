@@ -80,7 +80,7 @@ class TipMotion:
         step = self._acceleration_m_s2 * dt
         self._set_twist = nearer(self._set_twist, self._wanted, step)
         last = self.twist
-        self.twist = np.array(self._lag.step(self._set_twist))
+        self.twist = self._lag.step(self._set_twist)
         way = (last + self.twist) / 2 * dt
         # the same object where nothing turns, so that what is computed from it can be kept
         rotation = self.reported.rotation_rad
@@ -313,8 +313,7 @@ class VirtualCell(Transducer):
             raise ForceError(self.error, f"simulated fault: {self.error.value}")
 
     def _measure(self) -> None:
-        force_n, torque_nm = self._bench.plant.wrench_at_cell()
-        *counts, bits = self.convert((*force_n, *torque_nm))
+        *counts, bits = self.convert_once(self._bench.plant.wrench_at_cell())
         self._count += 1
         every = self.faults.lose_second_every
         if self.faults.silent or (every and self._count % every == 0):

@@ -18,6 +18,7 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import GRAVITY_M_S2, Payload
 from tactile_resonance.contact.vectors import (
+    Six,
     Vector,
     added,
     cross,
@@ -134,7 +135,7 @@ class Plant:
         self._stepped = False
         self._gravity_m_s2 = vector(GRAVITY_M_S2)
         self._places: list[Vector] = []  # of the carried mass, newest last
-        self._unloaded: tuple[Vector, Vector] | None = None  # what a cell that stands feels then
+        self._unloaded: Six | None = None  # what a cell that stands feels then
         self._period_s = 0.0
 
     def step(self, tip: Transform, dt_s: float) -> None:
@@ -179,7 +180,7 @@ class Plant:
             carried_m = added(place, rotated(self._turn, self.carried.centre_m))
             self._places = [*self._places[-2:], carried_m]
 
-    def wrench_at_cell(self) -> tuple[Vector, Vector]:
+    def wrench_at_cell(self) -> Six:
         """Force [N] and torque [N m] on the cell about its origin, in its frame, without noise.
 
         On the tool the cell feels the contact (through the beam), the weight of the tool beyond it
@@ -206,8 +207,8 @@ class Plant:
         tx, ty, tz = cross(difference(self.tip_m, origin), (fx, fy, fz))
         lx, ly, lz = cross(difference(centre, origin), load)
         wrench = (
-            rotated_back(turn, (fx + load[0], fy + load[1], fz + load[2])),
-            rotated_back(turn, (cx + tx + lx, cy + ty + ly, cz + tz + lz)),
+            *rotated_back(turn, (fx + load[0], fy + load[1], fz + load[2])),
+            *rotated_back(turn, (cx + tx + lx, cy + ty + ly, cz + tz + lz)),
         )
         if untouched:
             self._unloaded = wrench

@@ -21,7 +21,7 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.contact.vectors import Vector
+from tactile_resonance.contact.vectors import Six, Vector
 from tactile_resonance.fields import number, read_dataclass, require
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.cell.tcp_bus import TcpBus
@@ -213,14 +213,25 @@ def attach(robot: SimulatedRobot, plant: Plant, library: TissueLibrary) -> None:
 def attach_cell(robot: SimulatedRobot, plant: Plant, cell: LoadCell, bus: TcpBus) -> None:
     """Step a load cell with the plant, on the bus that it sends to; its faults are orders to the control port.
 
-    On the wall clock its frames are stamped with this machine's time, else with the plant's.
+    On the wall clock its frames are stamped with this machine's time, else with the plant's. Of steps that are
+    made together those in which its load stays are one for the cell.
     """
+    load: Six | None = None  # on the cell in the last step
+    left_s: float | None = None  # when that was, where the cell has not been stepped up to it
 
     def step() -> None:
+        nonlocal load, left_s
+        before, load = load, plant.wrench_at_cell()
+        if robot.time.to_follow and load is before:
+            left_s = plant.time_s
+            return
         if not robot.time.simulated:
             bus.keep_epoch(time.time(), plant.time_s)
-        force_n, torque_nm = plant.wrench_at_cell()
-        bus.send(cell.step((*force_n, *torque_nm), plant.time_s))
+        frames = []
+        if left_s is not None and before is not None and load is not before:
+            frames = cell.step(before, left_s)
+        left_s = None
+        bus.send(frames + cell.step(load, plant.time_s))
 
     def inject(fields: dict) -> None:
         """Fields ``fault`` and ``value``; 0 ends it. ``server_gone`` drops clients."""

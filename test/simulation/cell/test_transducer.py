@@ -142,7 +142,7 @@ def test_noise_and_resolution_are_those_required_of_a_cell():
     assert 1 / fine.force_divisor == pytest.approx(0.2e-3)
     transducer = Transducer(fine, seed=3)
     n = 20000
-    counts = np.array([transducer.convert((0.0,) * 6)[:6] for _ in range(n)])
+    counts = np.array([transducer.convert_once((0.0,) * 6)[:6] for _ in range(n)])
     force = counts[:, :3] / fine.force_divisor
     drift = fine.force_drift_n_per_s * 0.001 * np.arange(1, n + 1)
     residual = force - np.array(fine.force_bias_n) - drift[:, None]

@@ -210,7 +210,7 @@ def test_cell_under_the_sample_feels_reaction_and_weight_wherever_the_tip_turns(
     p = plant(mount=Mount.TABLE, carried=Payload(0.2, vector(centre)))
     p.step(at(0, 0, RADIUS_M), 0.002)
     p.step(at(0, 0, RADIUS_M - 4e-4, turn=(0.1, 0, 0)), 0.002)
-    force, torque = p.wrench_at_cell()
+    force, torque = np.reshape(p.wrench_at_cell(), (2, 3))
     normal = hertz(4e-4)
     np.testing.assert_allclose(force, [0, 0, -normal - 0.2 * G], rtol=1e-4)
     want = np.cross(centre, [0, 0, -0.2 * G])  # the tip presses above the cell's origin
@@ -225,7 +225,7 @@ def test_cell_on_the_tool_feels_contact_weight_and_inertia_in_its_own_frame():
     for n in range(3):
         place = np.array([0, 0, 0.05]) + acceleration * (0.002 * n) ** 2 / 2
         p.step(at(*place, turn=turn), 0.002)
-    force, torque = p.wrench_at_cell()
+    force, torque = np.reshape(p.wrench_at_cell(), (2, 3))
     cell = Rotation.from_rotvec(turn)
     load = 0.03 * (np.array([0, 0, -G]) - acceleration)
     np.testing.assert_allclose(force, cell.inv().apply(load), rtol=1e-6, atol=1e-9)

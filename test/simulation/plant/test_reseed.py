@@ -28,7 +28,7 @@ def steps(controller, count):
 
 
 def readings(transducer, count):
-    return np.array([transducer.convert(ZERO)[:6] for _ in range(count)])
+    return np.array([transducer.convert_once(ZERO)[:6] for _ in range(count)])
 
 
 def assert_variance(samples, variance):
