@@ -54,6 +54,8 @@ def test_a_robot_that_says_more_than_that_it_is_ready_is_ready(monkeypatch):
     child = robot_that_says(f"a warning\n{READY} 127.0.1.1\n", monkeypatch)
     assert child.alive
     child.close()
+    assert not child.alive
+    assert child._process.stdout.closed
 
 
 def test_what_a_robot_said_that_ended_is_named(monkeypatch):
