@@ -43,9 +43,6 @@ class Version(argparse.Action):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status, 0 or 1 with one line on stderr, 130 when interrupted."""
-    with contextlib.suppress(ValueError):  # of another thread than the main one
-        for number in ENDING[1:]:
-            signal.signal(number, signal.default_int_handler)
     try:
         parsed = _parser().parse_args(arguments)
         return parsed.run(parsed)
@@ -75,6 +72,8 @@ def command() -> NoReturn:
     if isinstance(sys.stdout, io.TextIOWrapper):  # a letter of a name that the terminal does not have
         sys.stdout.reconfigure(errors="backslashreplace")
     with contextlib.suppress(KeyboardInterrupt):  # one that came as the command ended
+        for number in ENDING[1:]:
+            signal.signal(number, signal.default_int_handler)
         status = main()
         for number in ENDING:
             signal.signal(number, signal.SIG_IGN)

@@ -4,6 +4,7 @@
 import argparse
 import math
 import os
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -13,6 +14,7 @@ import pytest
 
 from tactile_resonance import cli
 from tactile_resonance.commands.options import add_option
+from tactile_resonance.processes import ENDING
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -22,6 +24,14 @@ def test_version_is_that_of_the_package(capsys):
         cli.main(["--version"])
     version = ElementTree.parse(ROOT / "package.xml").findtext("version")
     assert capsys.readouterr().out == f"tactile_resonance {version}\n"
+
+
+def test_a_program_that_calls_a_command_keeps_its_handlers_of_signals(handlers):
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["--version"])
+    assert {signal.getsignal(number) for number in ENDING} == {signal.SIG_IGN}
 
 
 def test_an_option_has_the_kind_of_its_default_which_help_tells():

@@ -35,13 +35,10 @@ def limits(monkeypatch):
 
 
 @pytest.fixture
-def node(monkeypatch, limits):
+def node(monkeypatch, limits, handlers):
     """What `run_node` is given; the test's own handlers of signals are put back."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(free_domain_id(os.environ)))
-    before = {which: signal.getsignal(which) for which in (signal.SIGINT, signal.SIGTERM)}
-    yield lambda: rclpy.create_node("ending")
-    for which, handler in before.items():
-        signal.signal(which, handler)
+    return lambda: rclpy.create_node("ending")
 
 
 def test_an_interrupt_that_meets_the_middleware_at_work_is_no_crash(node, monkeypatch, limits):
