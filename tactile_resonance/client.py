@@ -346,14 +346,19 @@ class TactileClient:
         return self._call("repeat_point")
 
     def destroy(self) -> None:
-        """Take everything off the node again; a scan under way goes on, and its future is done as `LOST`."""
+        """Take everything off the node again; a scan under way goes on, and its future is done as `LOST`.
+
+        One that was not seen to begin is cancelled.
+        """
+        asked, self._asked = self._asked, None
+        if asked is not None and asked.heard is None:
+            self._steps.close()  # before what it sends with is destroyed
         self._node.destroy_timer(self._timer)
         self._node.destroy_subscription(self._points)
         for service in self._services.values():
             self._node.destroy_client(service)
         self._scans.destroy()
         self._calibrations.destroy()
-        asked, self._asked = self._asked, None
         if asked is not None:
             asked.future.set_result(asked.lost("its client was destroyed"))
 

@@ -414,6 +414,21 @@ def test_a_client_that_is_destroyed_leaves_no_future_undone(stack):
     assert stack.ended(stack.client.scan(**GOAL)).message == RUNNING
 
 
+@pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
+def test_a_scan_whose_client_is_destroyed_before_it_is_seen_to_begin_is_cancelled(stack, monkeypatch):
+    monkeypatch.setattr(client_module.AskedGoal, "hear", lambda *_: None)  # feedback is late
+    stack.activate()
+    other = TactileClient(stack.user)
+    future = other.scan(**GOAL)
+    stack.until(lambda: other._scans._pending_goal_requests)
+    stack.user.destroy_timer(other._timer)  # it looks no more
+    stack.until(lambda: stack.scan_node._goals.handle is not None)
+    stack.until(lambda: not other._scans._pending_goal_requests)  # its answer has come
+    other.destroy()
+    assert stack.ended(future).ending is Ending.LOST
+    stack.until(lambda: stack.scan_node._goals.handle is None)
+
+
 @pytest.mark.parametrize("kind", [ScanOutcome, CalibrationOutcome])
 def test_a_goal_whose_node_goes_away_before_a_run_is_lost_without_one(kind):
     asked = client_module.AskedGoal(None, kind, None, wait_s=1.0, on_feedback=None)
