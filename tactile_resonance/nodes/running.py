@@ -124,7 +124,8 @@ def run_node(make: Callable[[], Node]) -> None:
                 node.destroy_node()
     except (KeyboardInterrupt, ExternalShutdownException):
         # the interpreter, as it ends, takes handlers away
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for further in ENDING:
+            signal.signal(further, signal.SIG_IGN)
     except UNUSABLE as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)

@@ -104,8 +104,9 @@ def test_an_interrupt_shuts_ros_down_each_time_it_is_initialised(node):
             assert not rclpy.ok()
 
 
-def test_further_interrupts_do_not_end_a_node_half_way(tmp_path):
-    """Until the process has ended, they come again and again: people press Ctrl-C more than once."""
+@pytest.mark.parametrize("further", [signal.SIGINT, signal.SIGTERM])
+def test_further_signals_do_not_end_a_node_half_way(tmp_path, further):
+    """Until the process has ended: people press Ctrl-C more than once, launch sends SIGTERM after 5 s."""
     ended = tmp_path / "ended"
     program = f"""
 import time
@@ -113,7 +114,13 @@ from pathlib import Path
 from rclpy.node import Node
 from tactile_resonance.nodes.running import run_node
 
+class Late:
+    def __del__(self):  # called as the interpreter ends
+        time.sleep(0.5)
+
 class Slow(Node):
+    late = Late()
+
     def __init__(self):
         super().__init__("slow")
         self.up = self.create_timer(0.01, self.say)
@@ -133,9 +140,10 @@ run_node(Slow)
     command = [sys.executable, "-c", program]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout.readline() == "up\n"
+        process.send_signal(signal.SIGINT)
         while process.poll() is None:
-            process.send_signal(signal.SIGINT)
             time.sleep(0.01)
+            process.send_signal(further)
     assert process.returncode == 0
     assert ended.exists()
 
