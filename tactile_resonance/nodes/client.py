@@ -69,8 +69,8 @@ class NodeClient(ABC):
     def __enter__(self) -> Self:
         # an initialised context that is dropped stays known to rclpy's handler of signals, which then crashes
         with ExitStack() as opened:
-            rclpy.init(context=self._context)
-            opened.callback(rclpy.shutdown, context=self._context)
+            opened.callback(rclpy.try_shutdown, context=self._context)
+            rclpy.init(context=self._context)  # it is open also where its log fails
             self._node = rclpy.create_node(self._name, context=self._context)
             opened.callback(self._node.destroy_node)
             self._executor = SingleThreadedExecutor(context=self._context)

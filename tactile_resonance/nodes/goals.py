@@ -303,5 +303,5 @@ def _drop(futures: list[Future]) -> None:
 def _cancel_if_taken(future: Future) -> None:
     """Cancel a goal that was accepted and is no longer followed."""
     if not future.cancelled() and future.exception() is None and future.result().accepted:
-        with contextlib.suppress(RuntimeError):  # its client was destroyed meanwhile, or ROS shut down
+        with contextlib.suppress(RuntimeError):  # its client was destroyed, or ROS shut down
             future.result().cancel_goal_async()

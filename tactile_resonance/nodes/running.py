@@ -75,11 +75,11 @@ END_WITHIN_S = 20.0
 @contextmanager
 def initialised(**options: Any) -> Iterator[None]:
     """`with rclpy.init(**options)` of Kilted; in Jazzy `rclpy.init` returns nothing to enter."""
-    rclpy.init(**options)
     try:
+        rclpy.init(**options)
         yield
     finally:
-        rclpy.try_shutdown()
+        rclpy.try_shutdown()  # also where only the log cannot be written, and the context is open
         uninstall_signal_handlers()  # try_shutdown of Jazzy leaves them
 
 

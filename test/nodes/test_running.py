@@ -178,3 +178,29 @@ running.run_node(Hanging)
             process.kill()
     assert process.returncode == 1
     assert "in destroy_node" in errors  # where it hung
+
+
+@pytest.mark.parametrize("opened", ["LiveListener(None)", "initialised()"])
+def test_a_log_that_cannot_be_written_leaves_no_context_open(tmp_path, opened):
+    """An open one that is dropped ends Python with a segmentation fault at a later interrupt."""
+    program = f"""
+import rclpy
+from tactile_resonance.nodes.client import LiveListener
+from tactile_resonance.nodes.running import RCLError, initialised
+
+context = rclpy.Context()
+rclpy.Context = lambda: context
+try:
+    with {opened}:
+        print("opened")
+except RCLError as error:
+    print(error)
+print(context.ok() or rclpy.ok())
+"""
+    (tmp_path / "file").touch()
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(free_domain_id(os.environ))}
+    environment["ROS_LOG_DIR"] = str(tmp_path / "file" / "log")
+    command = [sys.executable, "-c", program]
+    told = subprocess.check_output(command, text=True, env=environment).splitlines()
+    assert "log directory" in told[0]
+    assert told[-1] == "False"
