@@ -5,13 +5,16 @@ import signal
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from tactile_resonance.processes import ENDING
 
 # The same examples in every run, as all random numbers here are seeded: a change is judged by what it changes.
-# ``--hypothesis-profile default`` looks for new ones.
-settings.register_profile("seeded", derandomize=True)
+# ``--hypothesis-profile default`` looks for new ones. How long they take is not judged: a machine may have
+# other work.
+settings.register_profile(
+    "seeded", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("seeded")
 
 
