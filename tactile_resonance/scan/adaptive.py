@@ -203,12 +203,12 @@ class Adaptive(Checked):
         process = surface.likeliest
         coarse = self._raster(CELLS // 2)
         at = coarse.xy_m[coarse.within]
-        f0_hz, variance = process.moments(at)
+        f0_hz, variance = process.moments(process.before(process.xy_m, at))
         std_hz = np.sqrt(variance)
         before = self.wanted.loss(f0_hz, std_hz)
         open_ = before > _OPEN * before.max()
         f0, std = f0_hz[open_, None], std_hz[open_, None]
-        _, there = process.moments(places_m[free])
+        _, there = process.moments(process.before(process.xy_m, places_m[free]))
         shared = process.covariance(at[open_], places_m[free])  # (o, f)
         known = shared**2 / (there + noise_hz**2)
         after = np.sqrt(np.maximum(std**2 - known, 0))

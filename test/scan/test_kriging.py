@@ -129,7 +129,8 @@ def test_a_mixture_has_the_moments_of_its_processes():
     assert np.sum(surface.shares) == pytest.approx(1)
     draws = []
     for share, process in zip(surface.shares, surface.processes, strict=True):
-        mean, covariance = process.moments(at)[0], process.covariance(at, at) + process.scatter**2 * np.eye(3)
+        mean = process.moments(process.before(xy, at))[0]
+        covariance = process.covariance(at, at) + process.scatter**2 * np.eye(3)
         draws.append(rng.multivariate_normal(mean, covariance, round(4e5 * share)))
     draws = np.concatenate(draws)
     value, std = surface.predict(at)
