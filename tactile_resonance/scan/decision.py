@@ -110,15 +110,15 @@ class Separate:
             return Verdict.HOPELESS, ""
         return Verdict.CONTINUE, ""
 
-    def log_likelihood_ratio(self, estimate: FloatArray, covariance: FloatArray) -> float:
-        """Logarithm of p(estimate | first) / p(estimate | second), class spread included.
+    def log_likelihood_ratio(self, estimates: FloatArray, covariance: FloatArray) -> FloatArray:
+        """(...) logarithm of p(estimate | first) / p(estimate | second) of (..., 2), class spread included.
 
         For poles of all blocks together, with covariance C / n, it equals the sum over n independent blocks
         of covariance C where the classes have no spread: Wald's statistic. With spread it is still the
         likelihood ratio of all that was seen.
         """
-        first = log_density(estimate, covariance, self.first)
-        return first - log_density(estimate, covariance, self.second)
+        first = log_density(estimates, covariance, self.first)
+        return first - log_density(estimates, covariance, self.second)
 
     def _highest(
         self, estimate: FloatArray, covariance: FloatArray, noise: FloatArray, left: float
@@ -131,16 +131,13 @@ class Separate:
         known = np.all(np.diag(noise) <= np.diag(covariance))  # not where it is NaN
         going = left * (noise if known else covariance)
         last = covariance - going
-        ratio = abs(self.log_likelihood_ratio(estimate, last))
         unit = np.sqrt(np.diag(going))
         values, vectors = np.linalg.eigh(going / np.outer(unit, unit))
         steps = (vectors * np.sqrt(np.maximum(values, 0))).T * unit
-        moved = [
-            self.log_likelihood_ratio(estimate + step, last)
-            - self.log_likelihood_ratio(estimate - step, last)
-            for step in steps
-        ]
-        return ratio + HOPELESS_STDS * float(np.linalg.norm(moved)) / 2
+        beside = estimate + np.stack([steps, -steps])
+        ratio, *moved = self.log_likelihood_ratio(np.vstack([estimate, *beside]), last)
+        more, less = np.reshape(moved, (2, -1))
+        return abs(ratio) + HOPELESS_STDS * float(np.linalg.norm(more - less)) / 2
 
 
 @dataclass(frozen=True)

@@ -175,9 +175,9 @@ def posteriors(
     return posterior / posterior.sum(axis=-1, keepdims=True), tails
 
 
-def log_density(estimate: FloatArray, noise: FloatArray, tissue: TissueClass) -> float:
-    """Logarithm of the density of an estimate (2,) with noise (2, 2), if it is of this tissue."""
-    return float(_density_and_tail(estimate, noise, tissue)[0])
+def log_density(estimates: FloatArray, noise: FloatArray, tissue: TissueClass) -> FloatArray:
+    """(...) logarithm of the density of estimates (..., 2) with noise (2, 2), if they are of this tissue."""
+    return _density_and_tail(estimates, noise, tissue)[0]
 
 
 def _density_and_tail(
