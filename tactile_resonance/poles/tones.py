@@ -271,12 +271,15 @@ def _lines_in_a_row(plan: JointPlan) -> bool:
 
 @lru_cache(maxsize=16)
 def _kinds(plan: JointPlan) -> list[BoolArray]:
-    """(K,) each, as `chances_of` takes them: excited lines, other even and odd harmonics, bins between."""
+    """(K,) each, as `least_chance` takes them: excited lines, other even and odd harmonics, bins between.
+
+    Other harmonics only where there are any.
+    """
     on_line, odd = plan.bins % plan.periods == 0, plan.bins // plan.periods % 2 == 1
     excited, others = np.zeros((2, odd.size), bool)
     excited[plan.excited_at] = others[plan.others_at] = True
     silent = others & on_line
-    return [excited, silent & ~odd, silent & odd, others & ~on_line]
+    return [excited, *filter(np.any, (silent & ~odd, silent & odd)), others & ~on_line]
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -294,15 +297,14 @@ def _most_striking(fitted: _Fitted) -> tuple[int, str] | None:
     if not plan.level_known:  # noise of the input may make more at a resonance
         least = np.maximum(least, 1.4 * median_filter(falls, 5))
     other = [np.zeros_like(kinds[0]), *kinds[1:]]
-    chances = {
-        "sensor": chances_of(falls, kinds, len(fitted.y), least),
-        "actuator": chances_of(input_power, other, len(fitted.u), rounding_u),
+    found = {
+        "sensor": least_chance(falls, kinds, len(fitted.y), least),
+        "actuator": least_chance(input_power, other, len(fitted.u), rounding_u),
     }
     tests = plan.excited_at.size + 2 * plan.others_at.size
-    channel = min(chances, key=lambda name: chances[name].min())
-    k = int(np.argmin(chances[channel]))
-    striking = chances[channel][k] * tests < FALSE_ALARM
-    return (int(plan.bins[k]), channel) if striking else None
+    channel = min(found, key=lambda name: found[name][0])
+    chance, k = found[channel]
+    return (int(plan.bins[k]), channel) if chance * tests < FALSE_ALARM else None
 
 
 def _spectrum_of(at: float, plan: JointPlan) -> ComplexArray:
@@ -420,9 +422,8 @@ def _most_striking_line(batch: PolesBatch, frf: FRF) -> int | None:
     least = ROUNDING * np.mean(np.abs(response[used]) ** 2) * weight**2
     power = falls_without_each(bases, response[None], np.ones_like(error), scale, error)[0]
     dof = frf.dof if by_line and frf.dof else np.inf
-    chance = chances_of(power, [used, none, none], 1, np.where(used, least, 1.0), dof)
-    line = int(np.argmin(chance))
-    return line if chance[line] * used.sum() < FALSE_ALARM else None
+    chance, line = least_chance(power, [used, none, none], 1, np.where(used, least, 1.0), dof)
+    return line if chance * used.sum() < FALSE_ALARM else None
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -460,22 +461,22 @@ def falls_without_each(
     return np.asarray(np.where(least > 1 - CERTAIN_LEVERAGE, falls, 0.0))
 
 
-def chances_of(
+def least_chance(
     power: FloatArray,
     kinds: list[BoolArray],
     records: int,
     least: FloatArray | float,
     most_dof: float = np.inf,
-) -> FloatArray:
-    """(K,) probability that noise makes a power as large as that of each bin, from those around.
+) -> tuple[float, int]:
+    """Least probability that noise makes a power as large as that of a bin, and which bin; from those around.
 
     Of powers (K,) that are means over records, divided by what has `most_dof` complex degrees of freedom;
     rounding has a level `least`. The kinds (K,) are first excited lines, then kinds of other harmonics, last
     the bins between, with noise alone. Harmonics may hold distortion: they are compared with the larger level
     of their own kind and of the noise. Other harmonics that are few of their kind are compared with the
-    excited ones; without excited ones they are not tested.
+    excited ones; without excited ones they are not tested. NaN where a power or level is.
     """
-    chance = np.ones(power.size)
+    found = [(1.0, 0)]
     levels = [level_around(power, kind, records, WINDOW) for kind in kinds]
     between, between_around = levels[-1]
     for k, (kind, (own, around)) in enumerate(zip(kinds, levels, strict=True)):
@@ -488,6 +489,7 @@ def chances_of(
         around = between_around or around
         if around:
             dof = min(records * around / MEDIAN_LOSS, most_dof)
-            ratio = power[kind] / np.maximum(level, least)[kind]
-            chance[kind] = special.fdtrc(2 * records, 2 * dof, ratio)
-    return chance
+            ratio = np.where(kind, power / np.maximum(level, least), 0.0)
+            at = int(np.argmax(ratio))
+            found.append((float(special.fdtrc(2 * records, 2 * dof, ratio[at])), at))
+    return found[int(np.argmin([chance for chance, _ in found]))]
