@@ -60,7 +60,7 @@ def _plain(array: npt.NDArray) -> npt.NDArray:
 def rehearse() -> None:
     """One fit of each kind, to little data."""
     from tactile_resonance.frf.result import FRF
-    from tactile_resonance.poles.identify import identify_batch
+    from tactile_resonance.poles.identify import identify_frf
     from tactile_resonance.poles.joint import JointPlan, PoleEstimator
     from tactile_resonance.poles.noise_level import two_channels
     from tactile_resonance.poles.structure import ModelStructure
@@ -74,7 +74,7 @@ def rehearse() -> None:
     kind = (1.0, 64, 2, np.arange(8, 25), (0.1, 0.4), ModelStructure(2, 2))
     JointPlan(*kind)(u[0], y[0])
     PoleEstimator(*kind)(u, y)
-    identify_batch(FRF(frequency_hz, g, np.ones(65), noise_dof=2), None, ModelStructure(2, 2))
+    identify_frf(FRF(frequency_hz, g, np.ones(65), noise_dof=2), None, ModelStructure(2, 2))
     two_channels(np.ones((1, 3)), np.ones((1, 3)), np.zeros(1, bool))  # of several realisations alone
 
 

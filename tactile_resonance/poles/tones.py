@@ -22,8 +22,8 @@ from scipy.optimize import minimize_scalar
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF
+from tactile_resonance.poles.compiled import entry, inner
 from tactile_resonance.poles.joint import JointPlan
-from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.result import PolesBatch, PolesStatus
 from tactile_resonance.tones import ROUNDING, Tone, level_around
 
@@ -426,12 +426,11 @@ def _most_striking_line(batch: PolesBatch, frf: FRF) -> int | None:
     return line if chance * used.sum() < FALSE_ALARM else None
 
 
-@np.errstate(divide="ignore", invalid="ignore")
 def falls_without_each(
     bases: tuple[ComplexArray, ComplexArray, ComplexArray],
     output: ComplexArray,
     u: ComplexArray,
-    scale: FloatArray | ComplexArray,
+    scale: ComplexArray,
     error: ComplexArray,
 ) -> FloatArray:
     """(M, K) what the cost falls by without a bin, in units of its variance.
@@ -440,25 +439,68 @@ def falls_without_each(
     and input (M, K), a `scale` (K,) that derivatives of the error are weighted with, over A, 0 on bins not
     used, and weighted errors (M, K), E|error|^2 = 1 of noise.
     """
-    of_a, of_b, of_c = bases
-    shared = np.concatenate([-output[..., None] * of_a[:, :-1], u[..., None] * of_b], axis=-1)
-    shared = shared * scale[:, None]  # (M, K, n)
-    own = of_c * scale[:, None]
-    records, bins, n = shared.shape
-    of_own = np.linalg.qr(real_rows(own).reshape(2 * bins, own.shape[-1]))[0]  # (2 K, c)
-    rest = real_rows(shared).reshape(records, 2 * bins, n)
-    for _ in range(2):  # twice is enough: the second pass removes what rounding left
-        rest = rest - of_own @ (of_own.T @ rest)
-    of_shared = np.linalg.qr(rest.reshape(-1, n))[0].reshape(rest.shape)
-    whole = np.concatenate([of_shared, np.broadcast_to(of_own, (records, *of_own.shape))], axis=-1)
-    q = whole.reshape(records, bins, 2, whole.shape[-1])
-    # (I - H) of each bin, 2 x 2: what of an error there the fit has left
-    left = np.eye(2) - q @ q.swapaxes(-1, -2)
-    p, r, b = left[..., 0, 0], left[..., 1, 1], left[..., 0, 1]
-    re, im = error.real, error.imag
-    falls = (r * re**2 - 2 * b * re * im + p * im**2) / (p * r - b**2)
-    least = (p + r) / 2 - np.hypot((p - r) / 2, b)  # eigenvalue
-    return np.asarray(np.where(least > 1 - CERTAIN_LEVERAGE, falls, 0.0))
+    falls = np.empty(error.shape)
+    _falls_without_each(*bases, output, u, scale, error, falls)
+    return falls
+
+
+@entry
+def _falls_without_each(of_a, of_b, of_c, output, u, scale, error, falls):
+    """Put what `falls_without_each` gives into the last."""
+    (records, bins), a, b, c = output.shape, of_a.shape[1] - 1, of_b.shape[1], of_c.shape[1]
+    # real and imaginary parts of derivatives by the C of each record, and by what records share
+    own, shared = np.empty((c, 2, bins)), np.empty((a + b, records, 2, bins))
+    for k in range(bins):
+        for i in range(c):
+            value = scale[k] * of_c[k, i]
+            own[i, 0, k], own[i, 1, k] = value.real, value.imag
+        for i in range(a + b):
+            of = -scale[k] * of_a[k, i] if i < a else scale[k] * of_b[k, i - a]
+            for m in range(records):
+                value = of * (output[m, k] if i < a else u[m, k])
+                shared[i, m, 0, k], shared[i, m, 1, k] = value.real, value.imag
+    for i in range(c):
+        _make_orthonormal(own[i].reshape(-1), own[:i].reshape(i, -1))
+    for i in range(a + b):
+        for m in range(records):
+            _take_off(shared[i, m].reshape(-1), own.reshape(c, -1))
+        _make_orthonormal(shared[i].reshape(-1), shared[:i].reshape(i, -1))
+    for m in range(records):
+        for k in range(bins):
+            # I - H, 2 x 2: what of an error there the fit has left
+            p, r, both = 1.0, 1.0, 0.0
+            for i in range(c + a + b):
+                of_bin = own[i, :, k] if i < c else shared[i - c, m, :, k]
+                re, im = of_bin[0], of_bin[1]
+                p, r, both = p - re * re, r - im * im, both - re * im
+            falls[m, k] = 0.0
+            if (p + r) / 2 - np.hypot((p - r) / 2, both) > 1 - CERTAIN_LEVERAGE:  # least eigenvalue
+                re, im = error[m, k].real, error[m, k].imag
+                falls[m, k] = (r * re * re - 2 * both * re * im + p * im * im) / (p * r - both * both)
+
+
+@inner
+def _take_off(column, basis):
+    """What a column has along each of the orthonormal rows of a basis; twice, for what rounding leaves."""
+    for _ in range(2):
+        for i in range(basis.shape[0]):
+            of, along = basis[i], 0.0
+            for k in range(column.size):
+                along += of[k] * column[k]
+            for k in range(column.size):
+                column[k] -= along * of[k]
+
+
+@inner
+def _make_orthonormal(column, basis):
+    """Make a column orthogonal to the rows of a basis, and its length 1; 0 where nothing is left."""
+    _take_off(column, basis)
+    square = 0.0
+    for k in range(column.size):
+        square += column[k] * column[k]
+    scale = 1 / np.sqrt(square) if square > 0 else 0.0
+    for k in range(column.size):
+        column[k] *= scale
 
 
 def least_chance(
