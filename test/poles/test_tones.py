@@ -21,6 +21,7 @@ from tactile_resonance.multisine import mains_lines
 from tactile_resonance.poles.estimator import identify_poles_from_bins
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.result import PolesStatus
+from tactile_resonance.poles.tones import falls_without_each
 
 SPACING_HZ = SAMPLE_RATE_HZ / SAMPLES_PER_PERIOD
 
@@ -291,3 +292,36 @@ def test_noise_of_an_frf_is_no_tone(spread):
             variance_noise=variance * rng.gamma(7, 1 / 7, 41),
         )
         assert "tone" not in identify_frf(frf, BAND_HZ).message
+
+
+@pytest.mark.parametrize("records", [1, 3])
+def test_the_cost_falls_without_a_bin_as_it_does_in_a_fit_without_it(records):
+    """Least squares fits to all bins and to all but one, of records that share A and B."""
+    rng, bins = np.random.default_rng(records), 9
+
+    def circular(*shape):
+        return rng.standard_normal((*shape, 2)).view(complex)[..., 0]
+
+    of_a, of_b, of_c = circular(bins, 3), circular(bins, 2), circular(bins, 2)
+    y, u, scale = circular(records, bins), circular(records, bins), circular(bins)
+    columns = np.zeros((records, bins, 4 + 2 * records), complex)
+    columns[..., :2], columns[..., 2:4] = -y[..., None] * of_a[:, :2], u[..., None] * of_b
+    for m in range(records):
+        columns[m, :, 4 + 2 * m : 6 + 2 * m] = of_c
+    columns *= scale[:, None]
+    target = circular(records, bins)
+
+    def error(kept):
+        rows, right = columns[kept], target[kept]
+        both = np.concatenate([rows.real, rows.imag]), np.concatenate([right.real, right.imag])
+        return right - rows @ np.linalg.lstsq(*both)[0]
+
+    everything = np.ones((records, bins), bool)
+    of_all = error(everything).reshape(records, bins)
+    expected = np.empty((records, bins))
+    for at in np.ndindex(records, bins):
+        kept = everything.copy()
+        kept[at] = False
+        expected[at] = np.sum(np.abs(of_all) ** 2) - np.sum(np.abs(error(kept)) ** 2)
+    found = falls_without_each((of_a, of_b, of_c), y, u, scale, of_all)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
