@@ -63,7 +63,7 @@ class RunContent:
     files : tuple of FileContent
         Finished files of the recording, in the order of the index; by the clock where one has no line there.
     results : tuple of PointResult
-        Of every attempt, by point and attempt.
+        Of every attempt but those before a damaged one, by point and attempt.
     problems : tuple of str
         Damaged, missing and foreign files, by name.
     unchecked : int
@@ -132,7 +132,8 @@ def read_run(path: Path) -> RunContent:
     """Everything readable of a run, of one that is being recorded too.
 
     Every byte is compared with the checksums of ``index.jsonl``, or, where a file has no line there, with those
-    in the file itself; a damaged file counts as if it were not there, and its point as not finished.
+    in the file itself; a damaged file counts as if it were not there, and its point as not finished: attempts
+    before it, which it replaced, have no result.
 
     Raises
     ------
@@ -154,12 +155,14 @@ def read_run(path: Path) -> RunContent:
     scene = entries.get(SCENE)
     if scene is not None and (damage := scene.damage(run.path / SCENE)):
         problems.append(f"{SCENE}: {damage}")
-    files, results, unchecked = [], [], 0
+    files, results, unchecked, lost = [], [], 0, [Path(name).name for name in missing]
     with ThreadPoolExecutor() as pool:  # a checksum holds no lock of the interpreter
         of_files = [entries.get(f"{RECORDING}/{file.name}") for file in paths]
-        for each in pool.map(_finished, paths, of_files, repeat(len(run.points))):
+        found = pool.map(_finished, paths, of_files, repeat(len(run.points)))
+        for path, each in zip(paths, found, strict=True):
             if isinstance(each, str):
                 problems.append(each)
+                lost.append(path.name)
                 continue
             content, result, checked = each
             files.append(content)
@@ -170,10 +173,12 @@ def read_run(path: Path) -> RunContent:
     if not all(file.name in place for file in files):
         place = {file.name: file.start_ns for file in files}
     files.sort(key=lambda file: place[file.name])
+    attempts = (POINT_FILE.fullmatch(name) for name in lost)
+    newest_lost = dict(sorted((int(match[1]), int(match[2])) for match in attempts if match))
     return replace(
         run,
         files=tuple(files),
-        results=in_order(results),
+        results=in_order(each for each in results if each.attempt > newest_lost.get(each.index, -1)),
         problems=tuple(problems),
         unchecked=unchecked,
     )

@@ -238,6 +238,26 @@ def test_a_damaged_file_is_named_and_its_point_measured_again(tmp_path):
         assert reader.message_count == 3 * 4
 
 
+@pytest.mark.parametrize("gone", [False, True])
+def test_where_the_newest_attempt_is_damaged_none_before_it_counts(tmp_path, gone):
+    """It was made for the one before did not count: as of a contact that was lost, or repeated on request."""
+    with create(tmp_path / "run") as run:
+        for index in (0, 1, 1, 2):
+            record_point(run, index)
+    path = tmp_path / "run" / "recording" / "point-00001-01.mcap"
+    if gone:
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-1])
+    with RunDirectory.open(tmp_path / "run") as run:
+        assert [result.index for result in run.content.latest] == [0, 2]
+        assert run.content.next_point.index == 1
+        record_point(run, 1)
+        assert run.content.next_point.index == 3
+        assert [result.index for result in run.content.latest] == [0, 1, 2]
+    assert [row.index for row in table_of(tmp_path / "run")] == [0, 1, 2]
+
+
 def test_a_summary_with_a_record_of_no_length_is_refused_in_one_line(tmp_path):
     with create(tmp_path / "run") as run:
         record_point(run, 0)
