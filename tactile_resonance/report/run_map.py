@@ -125,7 +125,7 @@ class RunBoundary:
         levels = " and ".join(f"{level:.2f}" for level in found.level_set.levels)
         lines = [
             f"Boundary at {levels} Hz after {counted(self.touches, 'touch', 'touches')}: "
-            f"{1e6 * found.area_m2:.1f} mm2 {found.level_set.side}, "
+            f"{1e6 * found.area_m2:.1f} mm2 {found.level_set.side} (+- {1e6 * found.area_std_m2:.2g} at most), "
             f"{1e6 * found.wrong_area_m2:.3g} mm2 expected on its wrong side, "
             f"{1e6 * self.wanted_m2:.3g} mm2 asked for{'' if self.met else ': not met'}."
         ]
