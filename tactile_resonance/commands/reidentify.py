@@ -45,6 +45,7 @@ def run(options: argparse.Namespace) -> int:
     """Identify, show how far it is, write both files, count."""
     # only here: the command answers --help without the library for recordings
     from tactile_resonance.scan.reidentify import reidentify
+    from tactile_resonance.scan.run_content import RECORDING
 
     order, terms = options.order, options.numerator_order
     require(order is not None or terms is None, "--numerator-order", terms, "one beside --order")
@@ -60,9 +61,12 @@ def run(options: argparse.Namespace) -> int:
         require(not several, "--output", None, "one name for the result of several runs")
         output = options.runs[0] / "reidentified"
     csv, npz = (output.with_name(output.name + ending) for ending in (".csv", ".npz"))
-    taken = output.name in ("results", "mechanics", "bins", "surface")
-    of_run = taken and (output.parent / "run.json").is_file()
-    require(not of_run, "--output", str(output), "a name that no file of the run itself has")
+    folder, taken = output.absolute().parent, output.name in ("results", "mechanics", "bins", "surface")
+    if folder.name == RECORDING:
+        folder, taken = folder.parent, True
+    of_run = taken and (folder / "run.json").is_file()
+    accepted = "a name that no file of the run itself has, not in its recording"
+    require(not of_run, "--output", str(output), accepted)
     begun_s = time.monotonic()
     with ProgressBar(unit_scale=True) as bar:
 

@@ -313,6 +313,7 @@ def test_what_it_refuses(runs, tmp_path, capsys):
         "--output: got": [str(runs[0]), "--output", str(tmp_path / "no" / "folder")],
         "a name that no file of the run": [str(runs[0]), "--output", str(runs[0] / "results")],
         "a name that no file of the run itself": [str(runs[0]), "--output", str(heights.with_suffix(""))],
+        "not in its recording": [str(runs[0]), "--output", str(runs[0] / "recording" / "again")],
         "--band: got [300.0, 200.0]": [str(runs[0]), "--band", "300", "200"],
         "order: 0": [str(runs[0]), "--order", "0"],
         "holds 4 excited lines": [str(runs[0]), "--band", "249", "259"],
