@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.estimate import disagreement
@@ -20,7 +21,7 @@ from tactile_resonance.poles.data import BinData, rules_between, with_noise
 from tactile_resonance.poles.fit import SEVERAL_MODES, best_of_split, minimise, refit_failed
 from tactile_resonance.poles.judgement import Judged
 from tactile_resonance.poles.lacking import Lack, asks
-from tactile_resonance.poles.levels import Levels, Spread
+from tactile_resonance.poles.levels import DISTORTION_PROBABILITY, Levels, Spread
 from tactile_resonance.poles.likelihood import Solution, moments
 from tactile_resonance.poles.noise_level import (
     BINS_PER_BAND,
@@ -374,7 +375,46 @@ def noise_of_moving_modes(
 
 
 def _several(first: _Round) -> Judged:
-    """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own."""
+    """What a fit of M >= 2 realisations of the phases is worth: one system, transients of their own.
+
+    Each counts by its own noise, where noise is all there is: of distortion nobody knows how much is in each.
+    """
+    judged, std, own = _together(first), _noise_of_each(first), first.plan.problem.sizes[2]
+    rows = np.flatnonzero(first.solution.plain & np.any(std != 1, axis=1))
+    if rows.size:
+        by, theta = std[rows, :, None], first.solution.theta[rows]
+        theta[..., -own:] /= by
+        plain = first.plain.rows(rows)
+        plain = plain._replace(y=plain.y / by, u=plain.u / by)
+        alike = _Round.weighted_with_noise(first.plan, plain, theta)
+        noise_alone = np.flatnonzero(~(alike.levels.distorted() | alike.levels.contradicts))
+        rows, of_alike = rows[noise_alone], _together(alike.rows(noise_alone))
+        of_alike.theta[:, -std.shape[1] * own :] *= std[rows].repeat(own, axis=1)
+        judged.put(rows, of_alike)
+    return judged
+
+
+def _noise_of_each(fitted: _Round) -> FloatArray:
+    """(batch, M) deviation of the noise of each realisation, of mean square 1; 1 where chance explains them.
+
+    From logarithms of the powers of errors between harmonics, which differ from one realisation to another by
+    those of their noise, whatever its spectrum, and have a variance of ``pi^2 / 6`` each.
+    """
+    plan, data, others = fitted.plan, fitted.plain, fitted.plan.others_at
+    if not others.size:
+        return np.ones(data.y.shape[:2])
+    alpha, beta, gamma = plan.problem.split(fitted.solution.theta)
+    error = (alpha @ plan.denominator_basis.values[others].T) * data.y[..., others]
+    error = error - (beta @ plan.numerator_on_bins[others].T) * data.u[..., others]
+    log_power = 2 * np.log(np.abs(error - gamma @ plan.transient_on_bins[others].T)).mean(axis=-1)
+    variance = np.exp(log_power - log_power.mean(axis=1, keepdims=True))
+    chi_square = others.size * np.sum(np.log(variance) ** 2, axis=1) / (np.pi**2 / 6)
+    differ = chi_square > special.chdtri(data.records - 1, DISTORTION_PROBABILITY)
+    return np.where(differ[:, None], np.sqrt(variance / variance.mean(axis=1, keepdims=True)), 1.0)
+
+
+def _together(first: _Round) -> Judged:
+    """What a fit of realisations that are equally noisy is worth."""
     rows = np.flatnonzero(first.solution.plain & _weighted_wrongly(first))
     if 0 < rows.size == first.kind.size:
         return _with_scatter(first)

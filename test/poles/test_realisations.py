@@ -208,6 +208,53 @@ def test_one_realisation_that_departs_from_all_others_is_named(odd):
     assert stats.binom.sf(wrongly - 1, RUNS, 1e-3) > 0.001
 
 
+class NoisyOutput(Plant):
+    """Ten times the noise of the sensor, as where somebody walks by during one realisation."""
+
+    @property
+    def noise(self):
+        return 100 * super().noise[0], super().noise[1]
+
+
+@pytest.mark.parametrize(("realisations", "periods"), [(2, 8), (3, 2), (8, 2)])
+def test_a_noisy_realisation_counts_by_its_noise(realisations, periods):
+    """Counted like the others variances were 15 to 20 times the bound, and of eight it departed in 8 %."""
+    all_plants = plants(0.02, 40.0, periods, realisations)
+    all_plants[1] = NoisyOutput(0.02, 40.0, periods, seed=11)
+    result = plan_of(periods).from_bins(*spectra(all_plants, np.random.default_rng(23), RUNS))
+    errors, bound = errors_of(result, 0.02), bound_of_realisations(all_plants)
+    # in one record of a hundred noise looks like distortion, and all count alike: medians leave these out
+    ratio = np.median(errors**2, axis=0) / np.diag(bound) / stats.chi2.median(1)
+    stated = np.median(result.total_covariance[:, 0][:, [0, 1], [0, 1]], axis=0) / np.diag(bound)
+    assert np.all(ratio < 1.3)
+    assert np.all(stated < 1.3)
+    for covariance in (result.covariance, result.total_covariance):
+        inside = RUNS * judge(errors, covariance[:, 0], bound)[1]
+        assert stats.binom.cdf(inside, RUNS, 0.94) > 0.0005
+    assert result.has_status(PolesStatus.OK).mean() > 0.99
+    assert np.mean(["departs" in remark for remark in result.remark]) < 0.005
+    # transients and levels are those of the records as they are
+    noise = np.mean([plant.noise[0] for plant in all_plants])
+    assert np.median(result.noise_variance[:, 0]) == pytest.approx(noise, rel=0.2)
+    bins, own = all_plants[0].bins(), result.fit.transient.shape[-1] // realisations
+    of_a = plan_of(periods).denominator_basis.values @ result.fit.denominator[0]
+    for m, plant in enumerate(all_plants):
+        c = plan_of(periods).transient_on_bins @ result.fit.transient[0, m * own : (m + 1) * own]
+        between = bins % periods != 0
+        off = np.mean(np.abs((c / of_a - plant.output(bins))[between]) ** 2)
+        assert off < plant.noise[0]
+
+
+def test_where_lines_are_distorted_a_noisy_realisation_counts_like_the_others():
+    """How much distortion is in each nobody knows: of two the quieter one's would be a model error."""
+    all_plants = [Plant(0.02, 40.0, 2, seed=10), NoisyOutput(0.02, 40.0, 2, seed=11)]
+    level = 10 * all_plants[0].noise[0]
+    result = plan_of(2).from_bins(*spectra(all_plants, np.random.default_rng(24), RUNS, level))
+    assert result.has_status(PolesStatus.OK).mean() > 0.99
+    inside = RUNS * judge(errors_of(result, 0.02), result.total_covariance[:, 0], np.eye(2))[1]
+    assert stats.binom.cdf(inside, RUNS, 0.94) > 0.0005
+
+
 def test_covariance_from_noise_is_what_repeated_noise_makes():
     """Distortion stays the same from run to run: it is the system's, only noise is another."""
     all_plants = plants(0.02, 40.0, 2, 3)
