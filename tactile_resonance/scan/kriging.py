@@ -39,7 +39,7 @@ _BLOCK = 40
 MOST_JOINT = 1000
 _NEIGHBOURS, _ALONG = 300, 12  # of a tile; tiles along the longer side
 MIXED_POINTS = 40
-"""Up to so many places, and up to `FIT_POINTS` values, length, size and scatter count as uncertain."""
+"""Up to so many places length, size and scatter count as uncertain."""
 # Of the mixture: steps of the logarithms of length and size; sizes in standard deviations of theirs; least
 # share of the largest; scatters over that of the values.
 _LENGTH_STEP, _SIZE_STEP, _SIZE_STEPS, _LEAST_SHARE = 0.7, 0.25, (-1.3, 0, 1.3, 2.6), 0.1
@@ -126,7 +126,9 @@ class KrigedSurface:
     Attributes
     ----------
     xy_m : (n, 2) float
+        Places.
     values, noise_std : (n,) float
+        Of several values in a place their weighted mean.
     constants : (k, 3) float
         Lengths [m], sizes and scatters that the points allow; one row where many points determine these.
     shares : (k,) float
@@ -212,16 +214,20 @@ def krige(
     # of many points the diagonal of all: their distances would take too much memory
     extent = float(np.linalg.norm(np.ptp(xy, axis=0)) if len(xy) > MOST_JOINT else pdist(xy).max())
     unit_m = 1e-9 * extent  # what is nearer is one place
-    places, place_of = np.unique(np.round(xy / unit_m), axis=0, return_inverse=True)
-    exact = place_of.ravel()[noise == 0]
+    places, first, at = np.unique(np.round(xy / unit_m), axis=0, return_index=True, return_inverse=True)
+    exact = at.ravel()[noise == 0]
     alone = len(np.unique(exact)) == len(exact)
     require(alone, "xy_m", "one place twice, without noise", "one exact value a place")
-    away = unit_m * cKDTree(places).query(places, k=2)[0][:, 1]
-    nearest = float(np.median(away[place_of.ravel()]))
+    if len(places) < len(y):  # what scatters from place to place is the same in all values of one
+        weight = 1 / np.maximum(noise, 1e-9 * _scale(y)) ** 2
+        known = np.bincount(at.ravel(), weight)
+        xy, y, noise = xy[first], np.bincount(at.ravel(), weight * y) / known, known**-0.5
+        noise[exact] = 0.0
+    nearest = float(np.median(unit_m * cKDTree(places).query(places, k=2)[0][:, 1]))
     scale, longest = _scale(y), min(10 * extent, most_length_m)
     lowest, highest = np.log(min(0.3 * nearest, longest)), np.log(longest)
     sizes = np.log(max(1e-4 * scale, least_std)), np.log(max(100 * scale, least_std))
-    if len(places) <= MIXED_POINTS and len(y) <= FIT_POINTS:
+    if len(y) <= MIXED_POINTS:
         lengths = lowest, max(lowest, min(highest, np.log(3 * extent)))
         constants, shares = _spread(lengths, sizes, xy, y, noise)
     else:
