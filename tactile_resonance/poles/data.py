@@ -214,18 +214,18 @@ def with_noise(
     error = _bin_by_bin(data.y[..., others] - transient)  # (points, K_o M)
     u = _bin_by_bin(np.broadcast_to(data.u, data.y.shape)[..., others])
     response = (beta[:, 0] @ plan.numerator_on_bins[plan.others_at].T / of_a).repeat(records, axis=1)
-    power_error, power_u, cross, correlated = _powers(error, u)
-    by_g, gain = response * u, cross / np.maximum(power_u, TINY)
-    # over a mode the phase of the response turns; its size would let the few bins of a peak decide
-    seen = correlated | _powers(error, by_g / np.maximum(np.abs(response), TINY))[3]
-    generator = common = seen
-    rest, size = error, error.shape[1]
+    generator = common = seen = follows_input(error, u, response)
+    rest, size, covariance = error, error.shape[1], np.empty((len(error), 0), complex)
     if seen.any():
+        power_error, power_u, cross, correlated = _powers(error, u)
+        by_g, gain = response * u, cross / np.maximum(power_u, TINY)
         rest_g, rest_alike = _mean_power(error - by_g), _mean_power(error - gain * u)
         generator = seen & (rest_g < power_error) & (rest_g <= MUCH_MORE * rest_alike)
         common = correlated & ~generator
         through = np.where(generator, by_g, np.where(common, gain * u, 0.0))
         rest = error - through
+        if common.any():
+            covariance = np.where(common, cross, 0.0)
     free = size / max(size - problem.sizes[2] * records / 2, 1.0)  # of what the transients have left
     pieces = _pieces_between(data.undriven, records)
     rest_power, kind = _by_piece(rest, pieces, free)
@@ -257,9 +257,19 @@ def with_noise(
         rest=np.where(of_rest > TINY, of_rest, 1.0),
         variance_y=np.where(of_y > TINY, of_y, 1.0),
         variance_u=_on(of_excited, variance_u),
-        covariance_yu=np.where(common, cross, 0.0) if common.any() else np.empty((len(data.y), 0)),
+        covariance_yu=covariance,
     )
     return weighted, mean, kind
+
+
+def follows_input(error: ComplexArray, u: ComplexArray, response: ComplexArray) -> BoolArray:
+    """(batch, 1) whether errors go with an input, or with what the response makes of it, beyond chance.
+
+    All (batch, K), on undriven bins.
+    """
+    # over a mode the phase of the response turns; its size would let the few bins of a peak decide
+    turned = response * u / np.maximum(np.abs(response), TINY)
+    return _powers(error, u)[3] | _powers(error, turned)[3]
 
 
 def _bin_by_bin(values: ComplexArray) -> ComplexArray:

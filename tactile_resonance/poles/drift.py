@@ -22,7 +22,7 @@ from numpy.polynomial import legendre
 from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
-from tactile_resonance.poles.data import BinData, rough_noise, with_noise
+from tactile_resonance.poles.data import BinData, follows_input, rough_noise, with_noise
 from tactile_resonance.poles.fit import Linearised
 from tactile_resonance.poles.joint import JointPlan
 from tactile_resonance.poles.joint_fit import noise_of_moving_modes
@@ -159,13 +159,12 @@ class DriftingModes:
         """(2 m, K) of 1 in the real and in the imaginary part of one row of the drift of each mode."""
         columns = []
         times, start = self._times(max(row, 1)), (-1) ** row * self._decay
-        for pole, residue in self._modes:
-            both = []
-            for p, r in ((pole, residue), (np.conj(pole), np.conj(residue))):
-                driven = r * self._lines
-                moved = self._spread(times, driven / (self._s - p) if row else driven)
-                both.append((moved + start * (row > 0)) / (self._s - p))
-            columns += [both[0] + both[1], 1j * (both[0] - both[1])]
+        for mode in self._modes:
+            p, r = (np.array([[z], [z.conjugate()]]) for z in mode)
+            driven = r * self._lines  # (2, K), of the pole above the real axis and the one below
+            moved = self._spread(times, driven / (self._s - p) if row else driven)
+            above, below = (moved + start * (row > 0)) / (self._s - p)
+            columns += [above + below, 1j * (above - below)]
         return np.array(columns)
 
     def added(self, drift: FloatArray) -> ComplexArray:
@@ -238,8 +237,8 @@ class DriftingModes:
 
     @staticmethod
     def _spread(times: ComplexArray, x: ComplexArray) -> ComplexArray:
-        """(K,) bins of a signal with bins x (K,) times a function of time."""
-        return np.asarray(scipy.fft.ifft(times * scipy.fft.fft(x, times.size))[: x.size])
+        """(..., K) bins of signals with bins x (..., K) times a function of time."""
+        return np.asarray(scipy.fft.ifft(times * scipy.fft.fft(x, times.size))[..., : x.shape[-1]])
 
 
 @lru_cache(maxsize=64)
@@ -265,22 +264,24 @@ def _linearised(
     directions = np.concatenate([modes.directions(row) for row in rows])
     others = plan.others_at.size
     data = BinData.of(y[None, None], u[None, None], plan.order, others)
-    known, *_ = with_noise(plan, data, theta[None, None])
-    alike = known.covariance_yu.size > 0  # noise on both channels
-    # what the input explains leaves its own noise, with the shape of the mode as a drift
-    flat &= alike or known.y is data.y
-    if not (flat and alike):
-        data = known  # what came through the input is no drift
-    at = Linearised.of(plan.problem, data, theta)
+    at, between = Linearised.of(plan.problem, data, theta), data.u[0][:, data.order[:others]]
+    model = modes.fit.fit
+    g = plan.numerator_on_bins @ model.numerator / (plan.denominator_basis.values @ model.denominator)
+    if not flat or follows_input(at.error[:, :others], between, g[None, plan.others_at]).any():
+        known, *_ = with_noise(plan, data, theta[None, None])
+        # unless it is noise on both channels, what the input explains leaves its own noise, with the shape of
+        # the mode as a drift
+        flat &= known.covariance_yu.size > 0 or known.y is data.y
+        if not flat:
+            data = known  # what came through the input is no drift
+            at = Linearised.of(plan.problem, data, theta)
     if flat:
-        variance_y, variance_u = rough_noise(at.error[:, :others], data.u[0][:, data.order[:others]])
-        if not alike:
-            variance_u = known.variance_u.mean(axis=-1, keepdims=True)
+        variance_y, variance_u = rough_noise(at.error[:, :others], between)
         data = data.weighted(rest=variance_y, variance_y=variance_y, variance_u=variance_u)
     costs, gradients, normals = moments(plan.problem.tables, data, theta[None, None])
     cost, gradient = float(costs.sum()), gradients[0, 0]
     variance = data.variance[0]
-    variance[others:] = data.residual_variance(plan.problem.response(theta[None]))[0]
+    variance[others:] = data.residual_variance(g[None, plan.excited_at])[0]
     root = 1 / np.sqrt(variance)
     own = np.ascontiguousarray(-(at.slope[0] * root[:, None]).T).view(float)  # (n, 2 K)
     residual = np.ascontiguousarray(at.error[0] * root).view(float)
