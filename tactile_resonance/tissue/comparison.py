@@ -26,6 +26,8 @@ _ALIKE_POINTS = 2  # of the mean spread of all groups, which count in that of ea
 # their number, and up to a third of maps of 8 to 20 points would be split.
 _FEWEST_COUNTED = 25
 
+_Mixture = tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]
+
 
 @dataclass(frozen=True, eq=False)
 class Differences:
@@ -241,11 +243,8 @@ def find_clusters(
     rng, tried = np.random.default_rng(seed), []
     largest = n if spread is not None else max(1, n // 4)  # a mean and a covariance are five numbers
     for count in range(1, min(most, largest) + 1):
-        starts = [
-            _mixture(x / unit, noise / scale, known, _seeds(x / unit, count, rng), degrees_of_freedom)
-            for _ in range(_STARTS if count > 1 else 1)
-        ]
-        tried.append(max(starts, key=lambda mixture: mixture[-1]))
+        starts = [_seeds(x / unit, count, rng) for _ in range(_STARTS if count > 1 else 1)]
+        tried.append(_mixture(x / unit, noise / scale, known, np.array(starts), degrees_of_freedom))
     # the likelihood of x has the units of 1 / x; it is that of the scaled points here, alike for all counts
     parameters = [(k - 1) + 2 * k + (0 if spread is not None else 3 * k) for k in range(1, len(tried) + 1)]
     counted = np.log(max(n, _FEWEST_COUNTED))
@@ -261,62 +260,74 @@ def find_clusters(
 
 def _mixture(
     x: FloatArray, noise: FloatArray, known: FloatArray | None, mean: FloatArray, degrees: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
-    """Expectation and maximisation from given means (K, 2) on, until the likelihood stands.
+) -> _Mixture:
+    """The likeliest of several: expectation and maximisation from given means (S, K, 2) on.
+
+    Each goes on until its likelihood stands. All are stepped at once: of few points a step is but calls.
 
     Returns
     -------
     weight, mean, covariance, probability, log_likelihood
         As of `Clusters`, of scaled points.
     """
-    count, n = len(mean), len(x)
+    starts, count, _ = mean.shape
+    n = len(x)
     wide = np.cov(x.T, ddof=0).reshape(2, 2) / count if known is None else known
-    weight = np.full(count, 1 / count)
-    covariance = np.broadcast_to(wide, (count, 2, 2)).copy()
-    fixed, log_likelihood = known is not None and np.isinf(degrees), -np.inf
+    weight = np.full((starts, count), 1 / count)
+    covariance = np.broadcast_to(wide, (starts, count, 2, 2)).copy()
+    fixed, log_likelihood = known is not None and np.isinf(degrees), np.full(starts, -np.inf)
     mean_noise = noise.mean(axis=0)
-    for _ in range(_MOST_STEPS):
-        # (n, K, ...): noise and group together, and what is known of each point's own place in the group
-        total = noise[:, None] + covariance
-        off = x[:, None] - mean
+    found: list[_Mixture] = []
+    for step in range(_MOST_STEPS):
+        # (S, n, K, ...): noise and group together, and what is known of each point's own place in the group
+        total = noise[:, None] + covariance[:, None]
+        off = x[:, None] - mean[:, None]
         inverse = np.linalg.inv(total)
-        squared = np.einsum("nki,nkij,nkj->nk", off, inverse, off)
-        log = np.log(weight) - np.log(2 * np.pi)
+        squared = np.einsum("snki,snkij,snkj->snk", off, inverse, off)
+        log = np.log(weight)[:, None] - np.log(2 * np.pi)
         log = log - 0.5 * (squared + np.log(np.linalg.det(total)))
-        largest = log.max(axis=1, keepdims=True)
+        largest = log.max(axis=-1, keepdims=True)
         density = np.exp(log - largest)
-        sums = density.sum(axis=1, keepdims=True)
+        sums = density.sum(axis=-1, keepdims=True)
         probability = density / sums
-        before, log_likelihood = log_likelihood, float(np.sum(np.log(sums) + largest))
+        before, log_likelihood = log_likelihood, np.sum(np.log(sums) + largest, axis=(1, 2))
         if known is not None and not fixed:  # and of what the known spread was estimated from
-            behind = covariance[0] + mean_noise
-            ratio = np.linalg.solve(behind, known + mean_noise)
-            log_likelihood += degrees / 2 * (np.linalg.slogdet(ratio)[1] - np.trace(ratio) + 2)
-        if log_likelihood - before < _CONVERGED * n:
-            break
-        members = probability.sum(axis=0) + np.finfo(float).tiny
-        weight = np.maximum(members / members.sum(), np.finfo(float).tiny)
+            ratio = np.linalg.inv(covariance[:, 0] + mean_noise) @ (known + mean_noise)
+            gap = np.linalg.slogdet(ratio)[1] - np.trace(ratio, axis1=-2, axis2=-1) + 2
+            log_likelihood = log_likelihood + degrees / 2 * gap
+        stands = log_likelihood - before < _CONVERGED * n
+        stands |= step == _MOST_STEPS - 1
+        if stands.any():
+            now = (weight, mean, covariance, probability, log_likelihood)
+            found += zip(*(each[stands] for each in now), strict=True)
+            if stands.all():
+                break
+            weight, mean, covariance, probability, log_likelihood = (each[~stands] for each in now)
+            off, inverse = off[~stands], inverse[~stands]
+        members = probability.sum(axis=1) + np.finfo(float).tiny
+        weight = np.maximum(members / members.sum(axis=1, keepdims=True), np.finfo(float).tiny)
         if fixed:  # the best mean is that of the points, weighted by their precisions
             weighted = probability[..., None, None] * inverse
-            pull = np.einsum("nkij,nj->ki", weighted, x)
-            mean = np.linalg.solve(weighted.sum(axis=0), pull[..., None])[..., 0]
+            pull = np.einsum("snkij,nj->ski", weighted, x)
+            mean = np.linalg.solve(weighted.sum(axis=1), pull[..., None])[..., 0]
             continue
-        gain = covariance @ inverse
-        place = mean + np.einsum("nkij,nkj->nki", gain, off)
-        left = covariance - gain @ covariance
-        mean = np.einsum("nk,nki->ki", probability, place) / members[:, None]
-        about = place - mean
+        gain = covariance[:, None] @ inverse
+        place = mean[:, None] + np.einsum("snkij,snkj->snki", gain, off)
+        left = covariance[:, None] - gain @ covariance[:, None]
+        mean = np.einsum("snk,snki->ski", probability, place) / members[..., None]
+        about = place - mean[:, None]
         scatter = about[..., :, None] * about[..., None, :] + left
-        sums_of = np.einsum("nk,nkij->kij", probability, scatter)
-        if known is not None:
-            kept = np.linalg.solve(behind, covariance[0])  # of the points behind the known spread, likewise
-            its = kept.T @ (known + mean_noise) @ kept + covariance[0] - covariance[0] @ kept
-            covariance = np.broadcast_to((sums_of.sum(axis=0) + degrees * its) / (n + degrees), (count, 2, 2))
+        sums_of = np.einsum("snk,snkij->skij", probability, scatter)
+        if known is not None:  # of the points behind the known spread, likewise
+            kept = np.linalg.solve(covariance[:, 0] + mean_noise, covariance[:, 0])
+            its = kept.swapaxes(1, 2) @ (known + mean_noise) @ kept + covariance[:, 0] - covariance[:, 0] @ kept
+            one = (sums_of.sum(axis=1) + degrees * its) / (n + degrees)
+            covariance = np.broadcast_to(one[:, None], sums_of.shape)
             continue
         # with that of all groups, without which the likelihood of a group about two points has no limit
-        alike = _ALIKE_POINTS * sums_of.sum(axis=0) / n
-        covariance = (sums_of + alike) / (members + _ALIKE_POINTS)[:, None, None]
-    return weight, mean, covariance, probability, log_likelihood
+        alike = _ALIKE_POINTS * sums_of.sum(axis=1, keepdims=True) / n
+        covariance = (sums_of + alike) / (members + _ALIKE_POINTS)[..., None, None]
+    return max(found, key=lambda mixture: mixture[-1])
 
 
 def _by_others(
