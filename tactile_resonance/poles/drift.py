@@ -224,12 +224,13 @@ class DriftingModes:
     @cached_property
     def _decay(self) -> ComplexArray:
         """(K,) the free decay from the start of the record."""
-        plan, theta = self.plan, self.theta
+        plan, theta, terms = self.plan, self.theta, self.plan.first_transient_terms
         a, b, _ = plan.problem.sizes
         alpha = np.append(theta[:a], 1.0)
         decay = np.zeros(self._s.size, complex)
         problem = plan.problem
-        decay[plan.order] = problem.transient @ theta[a + b :] / (problem.denominator @ alpha)
+        numerator = problem.transient[:, :terms] @ theta[a + b : a + b + terms]
+        decay[plan.order] = numerator / (problem.denominator @ alpha)
         return decay
 
     def _times(self, degree: int) -> ComplexArray:

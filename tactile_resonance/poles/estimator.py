@@ -21,6 +21,7 @@ from tactile_resonance.frf.result import FRF, BandBins, FrfStatus
 from tactile_resonance.poles.drift import poles_with_drift
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator, whole_harmonics
+from tactile_resonance.poles.knocks import instant_of_knock
 from tactile_resonance.poles.noise_level import channels_of, two_channels
 from tactile_resonance.poles.result import Poles, PolesBatch, PolesStatus, single
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
@@ -225,6 +226,17 @@ def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
     drifted = None
     if y.ndim == 1 and plan.periods > 1 and plan.others_at.size:
         drifted = poles_with_drift(plan, u, y, batch)
+        if (knock_s := instant_of_knock(plan, u, y, batch)) is not None:
+            # tones, and a mode that changes, stand out at some instants, too: what leaves less noise is right
+            with_knock = replace(plan, knocks_s=(*plan.knocks_s, knock_s))
+            others = [batch if drifted is None else drifted.fit, with_knock.from_bins(u, y)]
+            of_others, of_knock = (float(fit.noise_variance[0]) for fit in others)
+            if of_knock < min(of_others, noise_without_one_tone(plan, u, y, batch)):
+                note = (
+                    f"what rings from about {knock_s:.2g} s after the start of the record on is fitted too: a "
+                    "knock, noise that comes and goes, or beside either end a transient outside of the band"
+                )
+                return _of_plan(with_knock, u[None], y[None]).noting(note)
         # a drift fills the bins beside a line as tones would, for which dozens of fits are made; it takes up a
         # tone beside a narrow mode, too, but leaves more noise than there is without the tone
         if (

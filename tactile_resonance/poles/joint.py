@@ -31,6 +31,10 @@ from tactile_resonance.poles.result import PolesBatch
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.poles.tables import FitPlan, Problem
 
+# Beside those of the modes.
+TERMS_OF_A_KNOCK = 4
+# Part of a term of a further transient that the terms before do not have, from which it is one.
+LEAST_NEW = 1e-3
 METHOD = "joint maximum likelihood of poles and transient"
 
 
@@ -61,6 +65,8 @@ class JointPlan(FitPlan):
         with several it is estimated.
     left_out : tuple of int
         Bins that are neither: those of tones (`tones`).
+    knocks_s : tuple of float
+        Instants [s] after the start from which on a further transient is fitted (`knocks`).
 
     Raises
     ------
@@ -82,6 +88,7 @@ class JointPlan(FitPlan):
     transient_terms: int | None = None
     input_noise_ratio: float | None = None
     left_out: tuple[int, ...] = ()
+    knocks_s: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("samples_per_period", "periods", "transient_terms"):
@@ -226,6 +233,11 @@ class JointPlan(FitPlan):
         """(K, b) values of `numerator_basis` on all bins."""
         return self.numerator_basis.at(self.x, 0)[0]
 
+    @property
+    def first_transient_terms(self) -> int:
+        """Coefficients of the numerator of what decays from the start of the record."""
+        return self.structure.transient_terms if self.transient_terms is None else self.transient_terms
+
     @cached_property
     def transient_on_bins(self) -> ComplexArray:
         """(K, c) basis of the transient's numerator on all bins.
@@ -237,8 +249,16 @@ class JointPlan(FitPlan):
         """
         interval_s, order = 1 / self.sample_rate_hz, self.structure.order
         s = 2j * np.pi * self.frequency_hz
-        terms = self.structure.transient_terms if self.transient_terms is None else self.transient_terms
-        basis = PolynomialBasis.on_lines(np.exp(-s * interval_s), terms - 1).values
+        terms = self.first_transient_terms
+        # a knock makes modes outside of the band ring too, and its instant is not known exactly
+        most = max(terms, order + TERMS_OF_A_KNOCK)
+        of_knock = PolynomialBasis.on_lines(np.exp(-s * interval_s), most - 1).values
+        basis = of_knock[:, :terms]
+        for instant_s in self.knocks_s:
+            basis = np.append(basis, of_knock * np.exp(-s * instant_s)[:, None], axis=1)
+            q, r = np.linalg.qr(np.ascontiguousarray(basis.T).view(float).T)
+            new = np.abs(np.diagonal(r)) > LEAST_NEW * np.sqrt(len(basis))
+            basis = np.ascontiguousarray(q.T[new]).view(complex).T * np.sqrt(len(basis))
         if self.structure.domain == "z":
             return basis * np.exp(s * interval_s * order)[:, None]
         pairs = order // 2
