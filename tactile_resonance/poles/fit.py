@@ -309,7 +309,8 @@ def real_solution(matrix: ComplexArray, right: ComplexArray) -> FloatArray:
     column = np.linalg.norm(rows, axis=-2)
     column[~(column > 0)] = 1.0
     q, r = np.linalg.qr(rows / column[..., None, :])
-    solution = (np.linalg.pinv(r, np.finfo(float).eps * rows.shape[-2]) @ (q.mT @ right))[..., 0] / column
+    right = q.swapaxes(-1, -2) @ right
+    solution = (np.linalg.pinv(r, np.finfo(float).eps * rows.shape[-2]) @ right)[..., 0] / column
     return np.where(finite[..., None], solution, np.nan)
 
 
