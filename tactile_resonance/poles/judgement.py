@@ -211,8 +211,6 @@ def assemble(
         of_poles, in_f0 = propagated(quantities["poles_rad_s"][in_doubt], sensitivity[in_doubt], doubt)
         for name, more in (("pole_covariance", of_poles), ("covariance", in_f0), ("total_covariance", in_f0)):
             quantities[name][in_doubt] += more
-    if poles.shape[-1] > 2:
-        significant &= ~_sum_of_hidden(poles, significant)
     if (less := plan.poorer) is not None:
         certain = judged.level_known & ~undetermined & ~hopeless & ~judged.suspect
         asked = beside_others(poles, significant) & certain[:, None]
@@ -305,14 +303,3 @@ def _widen(quantities: dict[str, npt.NDArray], more: FloatArray) -> dict[int, st
             "uncertain: rely on the total covariance"
         )
     return notes
-
-
-def _sum_of_hidden(poles: ComplexArray, significant: BoolArray) -> BoolArray:
-    """(batch, k) wide modes across two others or more of which none is significant alone.
-
-    Noise hides each of these, but not their sum, which a mode as wide as all of them stands for.
-    """
-    apart = np.abs(poles.imag[:, :, None] - poles.imag[:, None, :])
-    across = (apart < np.abs(poles.real)[:, :, None]) & ~np.eye(poles.shape[-1], dtype=bool)
-    some = (across & significant[:, None, :]).any(axis=-1)
-    return np.asarray((across.sum(axis=-1) > 1) & ~some)

@@ -137,6 +137,12 @@ def test_total_covariances_hold_two_modes_whose_shares_are_uncertain(apart_hz, n
     assert told == (found.total_covariance[first, :, 0, 0] > 0).all()
 
 
+def test_a_mode_more_than_there_are_hides_neither_of_two():
+    """In 1 to 4 in a hundred both were taken for the sum of the others, and nothing was left."""
+    found, _ = responses(6, 6, 4, 0.01)
+    assert not found.has_status(PolesStatus.NO_RESONANCE).any()
+
+
 @pytest.mark.parametrize("order", [4, 6])
 def test_noise_beside_a_mode_is_none(order):
     found, _ = responses(order, order, 0, 1e-3)
