@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+END_WITHIN_S = 20.0
+"""A node must end within this after a signal; it draws the tip back first [s]."""
 GRACE_S = 5.0
 ORPHAN_POLL_S = 0.05
 ENDING = tuple(
@@ -103,13 +105,13 @@ class NodeProcesses:
             raise RuntimeError("; ".join(texts))
 
     def stop(self) -> None:
-        """Interrupt, and kill what has not ended within the grace period.
+        """Interrupt, and kill what has not ended though its own time to end is over.
 
         Child processes of a killed node end soon after it; they are waited for, too.
         """
         for process in self._processes.values():
             _signal(process, signal.SIGINT)
-        deadline = time.monotonic() + GRACE_S
+        deadline = time.monotonic() + END_WITHIN_S + GRACE_S
         orphans: list[Path] = []
         for process in self._processes.values():
             orphans += _children(process.pid)

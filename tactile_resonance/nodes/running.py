@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import uninstall_signal_handlers
 
 from tactile_resonance.drivers.acquisition import DeviceError
-from tactile_resonance.processes import ENDING, keep_memory
+from tactile_resonance.processes import END_WITHIN_S, ENDING, keep_memory
 
 RCLError = rclpy_implementation.RCLError
 
@@ -68,8 +68,6 @@ BEATS = _qos(10, reliable=False)
 
 
 STDERR = 2  # its descriptor
-END_WITHIN_S = 20.0
-"""A node must end within this after a signal; it draws the tip back first [s]."""
 
 
 @contextmanager
