@@ -62,15 +62,17 @@ def instant_of_knock(
     size = scipy.fft.next_fast_len(FINER * plan.bins.size)
     products = np.zeros((2, 1 + len(own), size), complex)
     products[..., plan.bins[plan.order] % size] = rings.conj()[:, None] * np.vstack([residual, own])
-    products = scipy.fft.ifft(products, norm="forward").real.T  # (instants, 1 + c, 2)
-    score, crossed = products[:, 0, :, None], products[:, 1:]
-    left = (rings.conj() @ rings.T).real - crossed.swapaxes(1, 2) @ crossed  # (instants, 2, 2)
-    there = np.flatnonzero(np.linalg.det(left) > LEAST_LEFT)
-    if not there.size:
-        return None
-    fall = np.sum(score[there] * np.linalg.solve(left[there], score[there]), axis=(1, 2))
+    products = scipy.fft.ifft(products, norm="forward").real  # (2, 1 + c, instants)
+    score, crossed = products[:, 0], products[:, 1:]
+    # what the transients leave of the two directions, 2 x 2 at each instant
+    whole = (rings.conj() @ rings.T).real
+    p, r = np.diagonal(whole)[:, None] - np.sum(crossed**2, axis=1)
+    both = whole[0, 1] - np.sum(crossed[0] * crossed[1], axis=0)
+    along = r * score[0] ** 2 - 2 * both * score[0] * score[1] + p * score[1] ** 2
+    left = p * r - both**2
+    fall = np.where(left > LEAST_LEFT, along / left, 0.0)
     best, dof = int(np.argmax(fall)), plan.bins.size - theta.size / 2
     share = min(fall[best] / np.sum(np.abs(residual) ** 2), 1.0)
     if size * np.exp((dof - 1) * np.log1p(-share)) > FALSE_ALARM:
         return None
-    return float(there[best] / (size * plan.resolution_hz))
+    return float(best / (size * plan.resolution_hz))
