@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, IntArray
 from tactile_resonance.frf.result import FRF, BandBins, FrfStatus
-from tactile_resonance.poles.drift import poles_with_drift
+from tactile_resonance.poles.drift import Drifted, poles_with_drift
 from tactile_resonance.poles.identify import identify_frf
 from tactile_resonance.poles.joint import JointPlan, PoleEstimator, whole_harmonics
 from tactile_resonance.poles.knocks import instant_of_knock
@@ -223,20 +223,15 @@ def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
     poles = _poles_with_all_bins(plan, u, y, batch)
     if poles is not None:
         return poles
-    drifted = None
+    drifted, knocks = None, ""
     if y.ndim == 1 and plan.periods > 1 and plan.others_at.size:
-        drifted = poles_with_drift(plan, u, y, batch)
-        if (knock_s := instant_of_knock(plan, u, y, batch)) is not None:
-            # tones, and a mode that changes, stand out at some instants, too: what leaves less noise is right
-            with_knock = replace(plan, knocks_s=(*plan.knocks_s, knock_s))
-            others = [batch if drifted is None else drifted.fit, with_knock.from_bins(u, y)]
-            of_others, of_knock = (float(fit.noise_variance[0]) for fit in others)
-            if of_knock < min(of_others, noise_without_one_tone(plan, u, y, batch)):
-                note = (
-                    f"what rings from about {knock_s:.2g} s after the start of the record on is fitted too: a "
-                    "knock, noise that comes and goes, or beside either end a transient outside of the band"
-                )
-                return _of_plan(with_knock, u[None], y[None]).noting(note)
+        plan, batch, drifted = _with_knocks(plan, u, y, batch)
+        if plan.knocks_s:
+            instants = ", ".join(f"{instant_s:.2g}" for instant_s in sorted(plan.knocks_s))
+            knocks = (
+                f"what rings from about {instants} s after the start of the record on is fitted too: a knock, "
+                "noise that comes and goes, or beside either end a transient outside of the band"
+            )
         # a drift fills the bins beside a line as tones would, for which dozens of fits are made; it takes up a
         # tone beside a narrow mode, too, but leaves more noise than there is without the tone
         if (
@@ -244,12 +239,28 @@ def _of_plan(plan: JointPlan, u: ComplexArray, y: ComplexArray) -> Poles:
             and not has_tones(plan, u, drifted.rest, drifted.fit)
             and drifted.fit.noise_variance[0] < noise_without_one_tone(plan, u, y, batch)
         ):
-            return drifted.poles
+            return drifted.poles.noting(knocks)
     rest, tones = poles_without_tones(plan, u, y, batch)
     # what leaves less noise is right
     if drifted is not None and not (tones and rest.noise_variance[0] <= drifted.fit.noise_variance[0]):
-        return drifted.poles
-    return single(rest, notes=[tone.text("left out") for tone in tones])
+        return drifted.poles.noting(knocks)
+    return single(rest, notes=[*(tone.text("left out") for tone in tones), knocks])
+
+
+def _with_knocks(
+    plan: JointPlan, u: ComplexArray, y: ComplexArray, batch: PolesBatch
+) -> tuple[JointPlan, PolesBatch, Drifted | None]:
+    """The plan with the knocks that are in bins u, y (K,), the fit with them, and the drift beside them."""
+    drifted = poles_with_drift(plan, u, y, batch)
+    while (knock_s := instant_of_knock(plan, u, y, batch)) is not None:
+        with_knock = replace(plan, knocks_s=(*plan.knocks_s, knock_s))
+        fit = with_knock.from_bins(u, y)
+        # tones, and a mode that changes, stand out at some instants, too: what leaves less noise is right
+        of_drift = (batch if drifted is None else drifted.fit).noise_variance[0]
+        if not fit.noise_variance[0] < min(of_drift, noise_without_one_tone(plan, u, y, batch)):
+            break
+        plan, batch, drifted = with_knock, fit, poles_with_drift(with_knock, u, y, fit)
+    return plan, batch, drifted
 
 
 @lru_cache(maxsize=32)
