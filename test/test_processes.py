@@ -71,6 +71,18 @@ def test_every_node_that_has_ended_is_named_with_its_last_line(tmp_path):
     assert told == f"frf_node {ended}; poles_node {ended}"
 
 
+def test_a_node_that_draws_the_tip_back_as_it_ends_is_not_killed(tmp_path, monkeypatch):
+    """The grace period begins when the node's own time to end is over."""
+    monkeypatch.setattr("tactile_resonance.processes.GRACE_S", 0.0)
+    script = "trap 'sleep 0.2; echo drawn back; exit' INT; echo begun; while :; do sleep 0.01; done"
+    log = tmp_path / "contact_node.log"
+    with NodeProcesses(tmp_path, ("sh", "-c", script)) as nodes:
+        nodes.start("contact_node")
+        while "begun" not in log.read_text():
+            time.sleep(0.01)
+    assert log.read_text() == "begun\ndrawn back\n"
+
+
 def test_parameters_reach_a_node_as_they_are(tmp_path):
     texts = ("", "a: b", "on", "null", "1e3", "[x]", "# no comment", "it's \"so\"", "ü", "a folder/b")
     given = {f"text{k}": text for k, text in enumerate(texts)}
