@@ -35,6 +35,22 @@ def test_a_program_that_calls_a_command_keeps_its_handlers_of_signals(handlers):
     assert {signal.getsignal(number) for number in ENDING} == {signal.SIG_IGN}
 
 
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_command_of_a_shell_ends_in_order_whichever_signal_ends_it(name):
+    program = f"""
+import os, signal
+from types import SimpleNamespace
+from tactile_resonance import cli
+
+parsed = SimpleNamespace(run=lambda _: os.kill(os.getpid(), signal.{name}))
+cli._parser = lambda: SimpleNamespace(parse_args=lambda _: parsed)
+cli.command()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr == "tactile_resonance: interrupted\n"
+
+
 def test_an_option_has_the_kind_of_its_default_which_help_tells():
     parser = argparse.ArgumentParser()
     add_option(parser, "--level P", 0.01, "of a test")
