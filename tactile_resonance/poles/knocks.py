@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.fft
+from scipy import special
 
 from tactile_resonance._typing import ComplexArray
 from tactile_resonance.poles.data import BinData, with_noise
@@ -39,8 +40,8 @@ def instant_of_knock(
 ) -> float | None:
     """Instant [s] from which on more rings than noise makes, in what the fit (shape ()) to bins (K,) leaves.
 
-    At each instant two directions, ``exp(-s t) / A`` and s times that, less what the terms of the transients
-    take up of them; what the cost falls by along both has an F test of 2 degrees of freedom.
+    At each instant as many directions as the model has poles, ``exp(-s t) s^k / A``, less what the terms of
+    the transients take up of them; what the cost falls by along all has an F test of as many degrees.
     """
     exact = not fit.noise_variance[0] > ROUNDED * np.mean(np.abs(y) ** 2)
     # a further transient would leave no noise
@@ -53,26 +54,29 @@ def instant_of_knock(
     at = Linearised.of(plan.problem, with_noise(plan, data, theta[None, None])[0], theta)
     root, s = 1 / np.sqrt(at.variance), plan.x[plan.order]
     weight = root / (plan.problem.denominator @ model.denominator)
-    terms = np.ascontiguousarray((plan.problem.transient * weight[:, None]).T)  # (c, K)
-    own = np.ascontiguousarray(np.linalg.qr(terms.view(float).T)[0].T).view(complex)
-    rings = weight * np.stack([s**0, s])
-    rings /= np.linalg.norm(rings, axis=-1, keepdims=True)
+    terms = (plan.problem.transient * weight[:, None]).T  # (c, K)
+    poles = plan.structure.order
+    own, rings = _orthonormal(terms), _orthonormal(weight * s ** np.arange(poles)[:, None])
     residual = at.error[0] * root
     residual = residual - (own.conj() @ residual).real @ own
     size = scipy.fft.next_fast_len(FINER * plan.bins.size)
-    products = np.zeros((2, 1 + len(own), size), complex)
+    products = np.zeros((poles, 1 + len(own), size), complex)
     products[..., plan.bins[plan.order] % size] = rings.conj()[:, None] * np.vstack([residual, own])
-    products = scipy.fft.ifft(products, norm="forward").real  # (2, 1 + c, instants)
-    score, crossed = products[:, 0], products[:, 1:]
-    # what the transients leave of the two directions, 2 x 2 at each instant
-    whole = (rings.conj() @ rings.T).real
-    p, r = np.diagonal(whole)[:, None] - np.sum(crossed**2, axis=1)
-    both = whole[0, 1] - np.sum(crossed[0] * crossed[1], axis=0)
-    along = r * score[0] ** 2 - 2 * both * score[0] * score[1] + p * score[1] ** 2
-    left = p * r - both**2
-    fall = np.where(left > LEAST_LEFT, along / left, 0.0)
+    products = scipy.fft.ifft(products, norm="forward").real.T  # (instants, 1 + c, poles)
+    score, crossed = products[:, 0, :, None], products[:, 1:]
+    left = np.eye(poles) - crossed.swapaxes(1, 2) @ crossed  # (instants, poles, poles)
+    there = np.flatnonzero(np.linalg.det(left) > LEAST_LEFT ** (poles / 2))
+    if not there.size:
+        return None
+    fall = np.sum(score[there] * np.linalg.solve(left[there], score[there]), axis=(1, 2))
     best, dof = int(np.argmax(fall)), plan.bins.size - theta.size / 2
     share = min(fall[best] / np.sum(np.abs(residual) ** 2), 1.0)
-    if size * np.exp((dof - 1) * np.log1p(-share)) > FALSE_ALARM:
+    if not size * special.betainc(dof - poles / 2, poles / 2, 1 - share) <= FALSE_ALARM:
         return None
-    return float(best / (size * plan.resolution_hz))
+    return float(there[best] / (size * plan.resolution_hz))
+
+
+def _orthonormal(rows: ComplexArray) -> ComplexArray:
+    """Rows (c, K) that span the same with real factors, the real part of each product 0, of each square 1."""
+    parts = np.ascontiguousarray(rows).view(float)
+    return np.ascontiguousarray(np.linalg.qr(parts.T)[0].T).view(complex)

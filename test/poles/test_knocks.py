@@ -71,6 +71,25 @@ def test_a_knock_costs_no_precision_wherever_it_is():
     assert np.sum(squared) < stats.chi2.isf(1e-3, 40)
 
 
+def test_a_knock_that_makes_two_modes_ring_is_found():
+    """With as many directions as a model of one mode has, it was in none of these, or next to none."""
+    other_rad_s = 2 * np.pi * 258 * (-0.02 + 1j * np.sqrt(1 - 0.02**2))
+    u, _ = record(noise=0.0)
+    s = 2j * np.pi * np.fft.rfftfreq(SAMPLES, 1 / RATE_HZ)
+    second = 0.03 * np.abs(other_rad_s) ** 2 / ((s - other_rad_s) * (s - np.conj(other_rad_s)))
+    of_second = np.fft.irfft(second * np.fft.rfft(u), SAMPLES)
+    structure, squared = ModelStructure.with_residual(4, 6), []
+    for seed, at_s in enumerate(np.arange(0.1, 1.1, 0.1)):
+        knock = ringing(at_s, 0.3, seed) + ringing(at_s, 0.3, seed + 100, other_rad_s)
+        poles = poles_of(seed, of_second, knock, structure=structure)
+        assert poles.status is PolesStatus.OK
+        assert "knock" in poles.message
+        for k, truth in enumerate((TRUTH, (258.0, 0.02))):
+            error = np.array([poles.f0_hz[k], poles.damping_ratio[k]]) - truth
+            squared.append(error @ np.linalg.solve(poles.best_covariance[k], error))
+    assert np.sum(squared) < stats.chi2.isf(1e-3, 2 * len(squared))
+
+
 def test_hum_beside_a_knock_is_left_out():
     hum = 0.02 * np.cos(2 * np.pi * 251.3 * TIME_S).reshape(PERIODS, SAMPLES)
     poles = poles_of(0, hum, ringing(0.03, 0.3, 0))
