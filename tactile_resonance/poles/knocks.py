@@ -62,18 +62,22 @@ def instant_of_knock(
     size = scipy.fft.next_fast_len(FINER * plan.bins.size)
     products = np.zeros((poles, 1 + len(own), size), complex)
     products[..., plan.bins[plan.order] % size] = rings.conj()[:, None] * np.vstack([residual, own])
-    products = scipy.fft.ifft(products, norm="forward").real.T  # (instants, 1 + c, poles)
-    score, crossed = products[:, 0, :, None], products[:, 1:]
-    left = np.eye(poles) - crossed.swapaxes(1, 2) @ crossed  # (instants, poles, poles)
-    there = np.flatnonzero(np.linalg.det(left) > LEAST_LEFT ** (poles / 2))
-    if not there.size:
-        return None
-    fall = np.sum(score[there] * np.linalg.solve(left[there], score[there]), axis=(1, 2))
+    products = scipy.fft.ifft(products, norm="forward").real
+    score, crossed = products[:, 0], products[:, 1:]  # (poles, instants), (poles, c, instants)
+    left = np.eye(poles)[..., None] - np.einsum("pci,qci->pqi", crossed, crossed)
+    fall, determinant = np.zeros(size), np.ones(size)
+    for k in range(poles):  # Gauss elimination, at all instants together
+        factor = left[k + 1 :, k] / left[k, k]
+        fall += score[k] ** 2 / left[k, k]
+        determinant *= left[k, k]
+        score[k + 1 :] -= factor * score[k]
+        left[k + 1 :, k + 1 :] -= factor[:, None] * left[k, k + 1 :]
+    fall[~(determinant > LEAST_LEFT ** (poles / 2))] = 0.0
     best, dof = int(np.argmax(fall)), plan.bins.size - theta.size / 2
     share = min(fall[best] / np.sum(np.abs(residual) ** 2), 1.0)
     if not size * special.betainc(dof - poles / 2, poles / 2, 1 - share) <= FALSE_ALARM:
         return None
-    return float(there[best] / (size * plan.resolution_hz))
+    return float(best / (size * plan.resolution_hz))
 
 
 def _orthonormal(rows: ComplexArray) -> ComplexArray:
