@@ -9,7 +9,8 @@ Axes 2, 3 and 4 are parallel, so that joints 2 to 4 move the wrist in the plane 
 ("outwards" and "up") as an arm of two links; axes 5 and 6 meet in the wrist's centre.
 
 A simulated robot does this several times a cycle, so it is compiled (numba, which looks at the date of this
-file alone: whatever is compiled for it is in here).
+file alone: whatever is compiled for it is in here). So are the two steps of an arm's state in each cycle:
+`follow`, joints that lag behind their target, and `feel`, what the sensor at the flange measures.
 """
 
 from __future__ import annotations
