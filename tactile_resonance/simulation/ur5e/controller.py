@@ -38,6 +38,8 @@ from tactile_resonance.simulation.ur5e.variables import (
 _LOG_LINES = 200
 # Joints slower than this are at rest when power is removed [rad/s]; above their wander.
 _AT_REST_RAD_S = 0.05
+# Measured force at the TCP beyond which the robot stops [N]; a setting of the safety configuration.
+_TOOL_FORCE_N = 150.0
 # Major, minor, bugfix, build.
 POLYSCOPE = (5, 21, 0, 0)
 SERIAL_NUMBER = "20265500001"
@@ -302,7 +304,7 @@ class UrController:
             self._run_program()
         self.machine.step(self.powered)
         force = self.machine.pressed_n
-        if force > self.machine.config.limits.tool_force_n and self.may_move:
+        if force > _TOOL_FORCE_N and self.may_move:
             self.protective_stop(f"force of {force:.0f} N at the tool")
         if self._next_mode is not None and self.time_s >= self._due_s:
             self.robot_mode, self._next_mode = self._next_mode, None

@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Turn, Vector, cross, rotated, rotated_back
 from tactile_resonance.simulation.noise import ROWS
 from tactile_resonance.simulation.ur5e.poses import (
@@ -23,31 +22,12 @@ from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Targe
 STANDARD_GRAVITY_M_S2 = 9.80665
 
 
-@dataclass(frozen=True)
-class FtSpecification:
-    """Errors of the built-in sensor.
-
-    The UR5e data sheet states, without saying what the words mean, an accuracy of 4.0 N and 0.3 N m
-    and a precision of 3.5 N and 0.2 N m. Here accuracy is read as two standard deviations of an offset
-    that stays until the sensor is zeroed, precision as two standard deviations of what a sample
-    carries, white noise and a slow drift together; how precision divides between the two is assumed.
-
-    Attributes
-    ----------
-    accuracy : (6,) array
-        Force [N] and torque [N m].
-    precision : (6,) array
-        The same.
-    drift_share : float
-        Share of the precision's variance that drifts.
-    drift_time_s : float
-        Correlation time of the drift [s].
-    """
-
-    accuracy: FloatArray = field(default_factory=lambda: np.array([4.0] * 3 + [0.3] * 3))
-    precision: FloatArray = field(default_factory=lambda: np.array([3.5] * 3 + [0.2] * 3))
-    drift_share: float = 0.5
-    drift_time_s: float = 60.0
+# Of force [N] and torque [N m], as the UR5e data sheet states them without saying what the words mean. Here
+# accuracy is read as two standard deviations of an offset that stays until the sensor is zeroed, precision as
+# two standard deviations of what a sample carries, white noise and a slow drift together.
+ACCURACY, PRECISION = np.array([4.0] * 3 + [0.3] * 3), np.array([3.5] * 3 + [0.2] * 3)
+# Share of the precision's variance that drifts, and correlation time of the drift [s] (assumed).
+DRIFT_SHARE, DRIFT_TIME_S = 0.5, 60.0
 
 
 @dataclass(frozen=True)
@@ -69,16 +49,23 @@ class ToolPayload:
 
 
 class FtSensor:
-    """The sensor: what it says beside the wrench that acts on the flange from outside."""
+    """The sensor: what it says beside the wrench that acts on the flange from outside.
 
-    def __init__(self, specification: FtSpecification, random: np.random.Generator) -> None:
-        self._offset = specification.accuracy / 2 * random.standard_normal(6)
-        sigma = specification.precision / 2
-        self._drift_rms = sigma * np.sqrt(specification.drift_share)
-        keep = np.exp(-CYCLE_S / specification.drift_time_s)
+    Parameters
+    ----------
+    random : numpy.random.Generator
+    errors : float
+        Size of its errors over those of the data sheet; 0: none.
+    """
+
+    def __init__(self, random: np.random.Generator, errors: float = 1.0) -> None:
+        self._offset = errors * ACCURACY / 2 * random.standard_normal(6)
+        sigma = errors * PRECISION / 2
+        self._drift_rms = sigma * np.sqrt(DRIFT_SHARE)
+        keep = np.exp(-CYCLE_S / DRIFT_TIME_S)
         self._keep = keep ** np.arange(1.0, ROWS + 1)[:, None]
         kick = self._drift_rms * np.sqrt(1 - keep**2)
-        self._rms = np.concatenate([kick, sigma * np.sqrt(1 - specification.drift_share)])
+        self._rms = np.concatenate([kick, sigma * np.sqrt(1 - DRIFT_SHARE)])
         self.reseed(random)
 
     def reseed(self, random: np.random.Generator) -> None:

@@ -26,6 +26,9 @@ from tactile_resonance.simulation.ur5e.poses import IDENTITY, Six, Transform
 # Figures of the table. Lengths in m; the twists alpha are 90, 0, 0, 90, -90 and 0 degrees.
 D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
 
+# Of a joint, by the UR5e data sheet: largest angle to either side, 360 degrees; largest speed, 180 degrees/s.
+JOINT_RANGE_RAD, JOINT_SPEED_RAD_S = math.tau, math.pi
+
 # By how much a cosine may pass 1 from rounding alone: a joint at the edge of its reach.
 _EDGE = 1e-9
 
@@ -252,16 +255,16 @@ def _solution(turn, place_m, shoulder, wrist, elbow, wrist_angle_rad):
 
 
 @njit
-def _closest(angle, wanted, joint_range_rad):
+def _closest(angle, wanted):
     """Return an angle with the whole turns added that bring it close to another."""
     closest = wanted + _within_a_turn(angle - wanted)
-    if abs(closest) > joint_range_rad:
+    if abs(closest) > JOINT_RANGE_RAD:
         closest -= math.copysign(math.tau, closest)
     return closest
 
 
-@njit(UniTuple(float64, 7)(_9, _3, _6, float64), cache=True)
-def _nearest(turn, place_m, near, joint_range_rad):
+@njit(UniTuple(float64, 7)(_9, _3, _6), cache=True)
+def _nearest(turn, place_m, near):
     """Return of all solutions, with whole turns added, that nearest to given angles; last how far it is."""
     best = (near[0], near[1], near[2], near[3], near[4], near[5], math.inf)
     for number in range(8):
@@ -269,9 +272,8 @@ def _nearest(turn, place_m, near, joint_range_rad):
         wrist = -1.0 if number & 2 else 1.0
         elbow = -1.0 if number & 1 else 1.0
         q = _solution(turn, place_m, shoulder, wrist, elbow, near[5])
-        a, b = _closest(q[0], near[0], joint_range_rad), _closest(q[1], near[1], joint_range_rad)
-        c, d = _closest(q[2], near[2], joint_range_rad), _closest(q[3], near[3], joint_range_rad)
-        e, f = _closest(q[4], near[4], joint_range_rad), _closest(q[5], near[5], joint_range_rad)
+        a, b, c = _closest(q[0], near[0]), _closest(q[1], near[1]), _closest(q[2], near[2])
+        d, e, f = _closest(q[3], near[3]), _closest(q[4], near[4]), _closest(q[5], near[5])
         way = abs(a - near[0]) + abs(b - near[1]) + abs(c - near[2])
         way = way + abs(d - near[3]) + abs(e - near[4]) + abs(f - near[5])
         if way < best[6]:
@@ -279,7 +281,7 @@ def _nearest(turn, place_m, near, joint_range_rad):
     return best
 
 
-def nearest_inverse(flange: Transform, near: Six, joint_range_rad: float = math.tau) -> Six | None:
+def nearest_inverse(flange: Transform, near: Six) -> Six | None:
     """Return the joint angles for a place of the flange that are nearest to given ones.
 
     Parameters
@@ -288,20 +290,18 @@ def nearest_inverse(flange: Transform, near: Six, joint_range_rad: float = math.
         The flange in the base.
     near : 6 floats
         Joint angles [rad]; whole turns are added to the solutions to come close to them.
-    joint_range_rad : float
-        Largest angle of a joint to either side [rad].
 
     Returns
     -------
     6 floats or None
         None where the place is out of reach.
     """
-    *joints, way = _nearest(*flange, near, joint_range_rad)
+    *joints, way = _nearest(*flange, near)
     return tuple(joints) if way < math.inf else None
 
 
-@njit(UniTuple(float64, 13)(_9, _3, _6, _6, float64, _9, _3, _9, _3), cache=True)
-def motion_to(turn, place_m, twist, near, joint_range_rad, tcp, tcp_m, back, back_m):
+@njit(UniTuple(float64, 13)(_9, _3, _6, _6, _9, _3, _9, _3), cache=True)
+def motion_to(turn, place_m, twist, near, tcp, tcp_m, back, back_m):
     """Return the motion of the joints that brings a TCP to a place with a twist, as numbers.
 
     Parameters
@@ -310,7 +310,7 @@ def motion_to(turn, place_m, twist, near, joint_range_rad, tcp, tcp_m, back, bac
         Of the TCP in the base.
     twist : 6 floats
         Its velocity [m/s] and angular velocity [rad/s] in the base.
-    near, joint_range_rad : 6 floats, float
+    near : 6 floats
         See `nearest_inverse`.
     tcp, tcp_m, back, back_m : 9 floats, 3 floats, twice
         The TCP in the flange, and the flange in it.
@@ -322,7 +322,7 @@ def motion_to(turn, place_m, twist, near, joint_range_rad, tcp, tcp_m, back, bac
         `near` [rad], infinite out of reach.
     """
     flange = _product(turn, place_m, back, back_m)
-    found = _nearest(flange[:9], flange[9:], near, joint_range_rad)
+    found = _nearest(flange[:9], flange[9:], near)
     numbers = _posture(found[:6])
     point_m = _product(numbers[:9], numbers[9:12], tcp, tcp_m)[9:]
     return found[:6] + _speeds(numbers[12:], point_m, twist) + found[6:]
@@ -348,12 +348,10 @@ def _turned(turn, x, y, z):
 
 
 @njit(
-    UniTuple(float64, 15)(*[_6] * 3, *[float64] * 2, boolean, *[float64] * 2, *[_9, _3] * 2),
+    UniTuple(float64, 15)(*[_6] * 3, *[float64] * 2, boolean, *[_9, _3] * 2),
     cache=True,
 )
-def motion_towards(
-    q, qd, goal, most, period_s, straight, joint_range_rad, joint_speed_rad_s, tcp, tcp_m, back, back_m
-):  # fmt: skip
+def motion_towards(q, qd, goal, most, period_s, straight, tcp, tcp_m, back, back_m):
     """Return the motion of the joints that brings the twist of a TCP nearer to a goal in a period.
 
     Parameters
@@ -366,10 +364,8 @@ def motion_towards(
         Largest change of the velocity [m/s], numerically that of the angular velocity too; the period.
     straight : bool
         Moving and turning end together, so that the path is kept.
-    joint_range_rad, tcp, tcp_m, back, back_m
+    tcp, tcp_m, back, back_m
         See `motion_to`.
-    joint_speed_rad_s : float
-        Largest speed of a joint.
 
     Returns
     -------
@@ -395,12 +391,12 @@ def motion_towards(
     px, py, pz = tool[9:]
     place = (px + (vx + x) * mean_s, py + (vy + y) * mean_s, pz + (vz + z) * mean_s)
     twist = (x, y, z, rx, ry, rz)
-    found = motion_to(turned, place, twist, q, joint_range_rad, tcp, tcp_m, back, back_m)
+    found = motion_to(turned, place, twist, q, tcp, tcp_m, back, back_m)
     within = True
     for k in range(6):
         on_the_way, then = (found[k] - q[k]) / period_s, found[6 + k]
-        within = within and abs(found[k]) <= joint_range_rad
-        within = within and max(abs(on_the_way), abs(then)) <= joint_speed_rad_s
+        within = within and abs(found[k]) <= JOINT_RANGE_RAD
+        within = within and max(abs(on_the_way), abs(then)) <= JOINT_SPEED_RAD_S
     return found + (1.0 if reached else 0.0, 1.0 if within else 0.0)
 
 

@@ -22,12 +22,12 @@ from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
     ForceMode,
     FtSensor,
-    FtSpecification,
     ToolPayload,
 )
 from tactile_resonance.simulation.ur5e.kinematics import (
     ARM_ROWS,
     FALL,
+    JOINT_RANGE_RAD,
     MASSES,
     SEEN,
     SPEEDS,
@@ -53,13 +53,7 @@ from tactile_resonance.simulation.ur5e.poses import (
     rounded,
     transform_from_pose,
 )
-from tactile_resonance.simulation.ur5e.target import (
-    CYCLE_S,
-    MotionLimits,
-    ScriptError,
-    Target,
-    rate,
-)
+from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target, rate
 
 
 @dataclass(frozen=True)
@@ -152,10 +146,10 @@ class MachineConfig:
         True pose of the tip in the flange; the program does not know it unless it sets its TCP so.
     tool : ToolPayload
         True mass on the flange; the controller compensates the payload that the program sets.
-    limits : MotionLimits
     tracking : TrackingParameters
         Of the joints; the vibration is the tip's.
-    ft : FtSpecification
+    ft_errors : float
+        Of the sensor in the flange; see `FtSensor`.
     contact_force_n : float
         Measured force that ``tool_contact`` takes for a contact. The robot's own threshold is not
         published; this is the model's.
@@ -164,9 +158,8 @@ class MachineConfig:
     start_q: Six = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
     tip_in_flange: Six = ZERO
     tool: ToolPayload = field(default_factory=ToolPayload)
-    limits: MotionLimits = field(default_factory=MotionLimits)
     tracking: TrackingParameters = field(default_factory=TrackingParameters)
-    ft: FtSpecification = field(default_factory=FtSpecification)
+    ft_errors: float = 1.0
     contact_force_n: float = 15.0
 
 
@@ -198,11 +191,11 @@ class Machine:
     ) -> None:
         self.config = config
         self.environment = environment
-        self.target = Target(config.start_q, config.limits)
+        self.target = Target(config.start_q)
         tracking, seed = config.tracking, int(random.integers(2**31))
         self._jitter = Jitter(tracking.jitter_rms_m, tracking.jitter_corner_rad_s, CYCLE_S, seed)
         self._lag = Lag(tracking, config.start_q, CYCLE_S)
-        self.sensor = FtSensor(config.ft, random)
+        self.sensor = FtSensor(random, config.ft_errors)
         self.force_mode = ForceMode(self.target)
         self.payload = config.tool
         self.gravity_m_s2: Vector = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)
@@ -333,7 +326,7 @@ class Machine:
 
     def within_limits(self, q: Six | None) -> bool:
         """Say whether joint angles, or None for a pose out of reach, are within the limits."""
-        return q is not None and largest(q) <= self.config.limits.joint_range_rad
+        return q is not None and largest(q) <= JOINT_RANGE_RAD
 
     def past_joints(self, steps: int) -> Six:
         """Return the joint angles of some cycles ago.

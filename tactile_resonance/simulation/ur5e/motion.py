@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tactile_resonance.contact.vectors import transposed, turn_product
-from tactile_resonance.simulation.ur5e.kinematics import Posture
+from tactile_resonance.simulation.ur5e.kinematics import JOINT_SPEED_RAD_S, Posture
 from tactile_resonance.simulation.ur5e.poses import (
     ZERO,
     Six,
@@ -24,7 +24,13 @@ from tactile_resonance.simulation.ur5e.poses import (
     turn_between,
     turned,
 )
-from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target, Thread
+from tactile_resonance.simulation.ur5e.target import (
+    CYCLE_S,
+    TOOL_SPEED_M_S,
+    ScriptError,
+    Target,
+    Thread,
+)
 
 
 @dataclass(frozen=True)
@@ -94,14 +100,14 @@ def movej(target: Target, goal: Six, acceleration: float, speed: float) -> Threa
     if length == 0.0:
         return
     direction = tuple([way / length for way in way_to_go])
-    speed = min(speed, target.limits.joint_speed_rad_s)
+    speed = min(speed, JOINT_SPEED_RAD_S)
     tool_speed = 0.0  # of the TCP, with the leading joint at 1 rad/s
     for check in range(_SPEED_CHECKS):
         posture = Posture(_along(start, way_to_go, check / (_SPEED_CHECKS - 1)))
         velocity = posture.twist(posture.tool(target.tcp)[1], direction)[:3]
         tool_speed = max(tool_speed, math.hypot(*velocity))
     if tool_speed > 0.0:
-        speed = min(speed, _SPEED_MARGIN * target.limits.tool_speed_m_s / tool_speed)
+        speed = min(speed, _SPEED_MARGIN * TOOL_SPEED_M_S / tool_speed)
     profile = Trapezoid(length, speed, acceleration)
     yielded = target.yielded_q
     time = 0.0
@@ -134,7 +140,7 @@ def movel(target: Target, goal: Transform, acceleration: float, speed: float) ->
     length = max(math.hypot(*shift), math.hypot(*turn))
     if length == 0.0:
         return
-    profile = Trapezoid(length, min(speed, target.limits.tool_speed_m_s), acceleration)
+    profile = Trapezoid(length, min(speed, TOOL_SPEED_M_S), acceleration)
     direction = tuple([value / length for value in (*shift, *turn)])
     yielded_m, yielded_back = target.yielded_m, transposed(target.yielded_turn)
     time = 0.0
@@ -161,7 +167,7 @@ def speedl(target: Target, twist: Six, acceleration: float, time_s: float = 0.0)
     holds for turning too, in rad/s^2.
     """
     _require_positive("speedl", "acceleration", acceleration)
-    fast = math.hypot(*twist[:3]) / target.limits.tool_speed_m_s
+    fast = math.hypot(*twist[:3]) / TOOL_SPEED_M_S
     share = target.pace / max(1.0, fast)
     goal = tuple([value * share for value in twist])
     yield from _repeated(lambda: _step_twist(target, goal, acceleration), time_s)
@@ -173,7 +179,7 @@ def speedj(target: Target, speeds: Six, acceleration: float, time_s: float = 0.0
     Returns after `time_s`, or once the speeds are reached where that is 0.
     """
     _require_positive("speedj", "acceleration", acceleration)
-    share = target.pace / max(1.0, largest(speeds) / target.limits.joint_speed_rad_s)
+    share = target.pace / max(1.0, largest(speeds) / JOINT_SPEED_RAD_S)
     goal = tuple([value * share for value in speeds])
     yield from _repeated(lambda: _step_joints(target, goal, acceleration), time_s)
 

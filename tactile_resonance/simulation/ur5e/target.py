@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator
-from dataclasses import dataclass
 from operator import sub
 
 from tactile_resonance.contact.vectors import NO_TURN, Turn, Vector, transposed, turn_product
 from tactile_resonance.simulation.ur5e.kinematics import (
+    JOINT_RANGE_RAD,
+    JOINT_SPEED_RAD_S,
     Posture,
     motion_to,
     motion_towards,
@@ -34,6 +35,11 @@ from tactile_resonance.simulation.ur5e.poses import (
 # The control period of an e-series [s].
 CYCLE_S = 0.002
 
+# Largest speed of the TCP [m/s]; a setting of the safety configuration.
+TOOL_SPEED_M_S = 1.5
+# Deceleration of stops that no program asks for [rad/s^2] (assumed).
+BRAKE_RAD_S2 = 10.0
+
 # Of a program: steps once in a cycle, until it is done.
 Thread = Generator[None, None, None]
 
@@ -44,32 +50,6 @@ class ScriptError(Exception):
 
 class ProtectiveStop(Exception):
     """A limit of the robot was reached; the controller brakes and waits to be unlocked."""
-
-
-@dataclass(frozen=True)
-class MotionLimits:
-    """Limits of the arm and of its safety configuration.
-
-    Attributes
-    ----------
-    joint_range_rad : float
-        Largest angle to either side; +-360 degrees (UR5e data sheet).
-    joint_speed_rad_s : float
-        180 degrees/s (UR5e data sheet).
-    tool_speed_m_s : float
-        Largest speed of the TCP; a setting of the safety configuration.
-    tool_force_n : float
-        Measured force at the TCP beyond which the robot stops; a setting of the safety
-        configuration.
-    brake_rad_s2 : float
-        Deceleration of stops that no program asks for (assumed).
-    """
-
-    joint_range_rad: float = math.tau
-    joint_speed_rad_s: float = math.pi
-    tool_speed_m_s: float = 1.5
-    tool_force_n: float = 150.0
-    brake_rad_s2: float = 10.0
 
 
 class Target:
@@ -94,8 +74,7 @@ class Target:
         `yielded_q` when force mode began; None without it.
     """
 
-    def __init__(self, q: Six, limits: MotionLimits) -> None:
-        self.limits = limits
+    def __init__(self, q: Six) -> None:
         self._tcp = self._flange_in_tcp = IDENTITY
         self.pace = 1.0
         self.q, self._posture = q, Posture(q)
@@ -159,7 +138,7 @@ class Target:
     def end_cycle(self) -> None:
         """Brake where nothing moved the arm, and note the acceleration of the cycle."""
         if not self.commanded:
-            self.brake(self.limits.brake_rad_s2)
+            self._brake()
         self._accelerated = self._cycle_qd, self.qd
 
     def command(self, q: Six, qd: Six, *, within: bool = False) -> None:
@@ -191,7 +170,6 @@ class Target:
         """
         numbers = motion_towards(
             *(self.q, self.qd, goal, acceleration * CYCLE_S, CYCLE_S, straight),
-            *(self.limits.joint_range_rad, self.limits.joint_speed_rad_s),
             *(*self._tcp, *self._flange_in_tcp),
         )
         if numbers[12] == math.inf:
@@ -217,12 +195,12 @@ class Target:
         self.yielded_turn = turn_product(turn, self.yielded_turn)
         self.q = q
 
-    def brake(self, deceleration_rad_s2: float) -> None:
+    def _brake(self) -> None:
         """Brake by one cycle, all joints in proportion."""
         if not any(self.qd):
             return
-        share = max(0.0, 1.0 - deceleration_rad_s2 * CYCLE_S / largest(self.qd))
-        limit, way_s = self.limits.joint_range_rad, (1 + share) / 2 * CYCLE_S
+        share = max(0.0, 1.0 - BRAKE_RAD_S2 * CYCLE_S / largest(self.qd))
+        limit, way_s = JOINT_RANGE_RAD, (1 + share) / 2 * CYCLE_S
         reached = [q + qd * way_s for q, qd in zip(self.q, self.qd, strict=True)]
         self.q = tuple([max(-limit, min(limit, q)) for q in reached])
         self.qd = tuple([qd * share for qd in self.qd])
@@ -233,13 +211,11 @@ class Target:
 
     def solve(self, tool: Transform, q_near: Six) -> Six | None:
         """Return the joint angles for a TCP in the base, nearest to `q_near`; None out of reach."""
-        flange = product(tool, self._flange_in_tcp)
-        return nearest_inverse(flange, q_near, self.limits.joint_range_rad)
+        return nearest_inverse(product(tool, self._flange_in_tcp), q_near)
 
     def _motion_to(self, tool: Transform, twist: Six) -> tuple[Six, Six]:
         """Return angles and speeds of the joints for a TCP in the base, nearest to the present ones."""
-        near = self.q, self.limits.joint_range_rad
-        numbers = motion_to(*tool, twist, *near, *self._tcp, *self._flange_in_tcp)
+        numbers = motion_to(*tool, twist, self.q, *self._tcp, *self._flange_in_tcp)
         if numbers[12] == math.inf:
             raise _out_of_reach(tool)
         return numbers[:6], numbers[6:12]
@@ -250,18 +226,17 @@ class Target:
 
     def _check(self, q: Six, qd: Six = ZERO) -> None:
         """Refuse angles out of limits, and speeds: those given and those with which it is reached."""
-        limits = self.limits
         reached = largest(q)
-        if reached > limits.joint_range_rad:
+        if reached > JOINT_RANGE_RAD:
             raise ProtectiveStop(f"a joint would reach {reached:.3f} rad, beyond its range")
         for speeds in (qd, rate(self.q, q)):
             fastest = largest(speeds)
             # rounding of a finite difference must not stop a joint that moves at its limit
-            if fastest > limits.joint_speed_rad_s * (1 + 1e-6):
+            if fastest > JOINT_SPEED_RAD_S * (1 + 1e-6):
                 joint = [abs(speed) for speed in speeds].index(fastest) + 1
                 raise ProtectiveStop(
                     f"joint {joint} would turn at {fastest:.2f} rad/s, "
-                    f"above its limit of {limits.joint_speed_rad_s:.2f} rad/s"
+                    f"above its limit of {JOINT_SPEED_RAD_S:.2f} rad/s"
                 )
 
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from tactile_resonance.simulation.cell.transducer import CellParameters, LoadCell, Transducer
 from tactile_resonance.simulation.noise import ROWS, Jitter
 from tactile_resonance.simulation.ur5e.controller import UrController
-from tactile_resonance.simulation.ur5e.forces import FtSensor, FtSpecification
+from tactile_resonance.simulation.ur5e.forces import ACCURACY, DRIFT_SHARE, PRECISION, FtSensor
 from tactile_resonance.simulation.ur5e.machine import TrackingParameters
 from tactile_resonance.simulation.ur5e.poses import ZERO
 
@@ -60,10 +60,10 @@ def test_robots_with_different_histories_have_the_noise_of_one_seed(seed):
 
 
 def test_vibration_and_drift_begin_anew_in_their_stationary_state():
-    specification, parameters = FtSpecification(), TrackingParameters()
-    sensor = FtSensor(specification, np.random.default_rng(1))
+    parameters = TrackingParameters()
+    sensor = FtSensor(np.random.default_rng(1))
     jitter = Jitter(parameters.jitter_rms_m, parameters.jitter_corner_rad_s, 0.002, 1)
-    offset = specification.accuracy / 2 * np.random.default_rng(1).standard_normal(6)
+    offset = ACCURACY / 2 * np.random.default_rng(1).standard_normal(6)
     drifts, places = [], []
     for seed in range(400):
         sensor.reseed(np.random.default_rng([5, seed]))
@@ -71,9 +71,9 @@ def test_vibration_and_drift_begin_anew_in_their_stationary_state():
         errors = [sensor.error() for _ in range(40)]
         drifts.append(np.mean(errors, axis=0) - offset)
         places.append(jitter.step())
-    sigma = specification.precision / 2
+    sigma = PRECISION / 2
     # 40 steps are short against the drift's 60 s, and their white noise is averaged
-    variance = sigma**2 * (specification.drift_share + (1 - specification.drift_share) / 40)
+    variance = sigma**2 * (DRIFT_SHARE + (1 - DRIFT_SHARE) / 40)
     assert_variance(np.array(drifts) / np.sqrt(variance), 1.0)
     assert_variance(places, parameters.jitter_rms_m**2)
 

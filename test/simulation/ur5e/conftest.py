@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tactile_resonance.simulation.ur5e.controller import UrController
-from tactile_resonance.simulation.ur5e.forces import FtSpecification
 from tactile_resonance.simulation.ur5e.machine import MachineConfig, TrackingParameters
 
 PROGRAM = """
@@ -18,8 +17,6 @@ def rtde_control():
 {offset}
 end
 """
-
-EXACT_FT = FtSpecification(accuracy=np.zeros(6), precision=np.zeros(6))
 
 
 class Client:
@@ -88,7 +85,7 @@ def make_client() -> Callable[..., Client]:
     """Return a maker of clients with controllers of their own, without noise where not asked for."""
 
     def make(environment=None, *, offset=0, seed=1, machine=None, **machine_fields) -> Client:
-        fields = {"ft": EXACT_FT, "tracking": TrackingParameters(jitter_rms_m=0.0)}
+        fields = {"ft_errors": 0.0, "tracking": TrackingParameters(jitter_rms_m=0.0)}
         machine = MachineConfig(**{**fields, **machine_fields}) if machine is None else machine
         return Client(UrController(machine, environment, seed), offset)
 

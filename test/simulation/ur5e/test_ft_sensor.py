@@ -12,7 +12,6 @@ from scipy.stats import chi2
 from tactile_resonance.simulation.ur5e.forces import (
     STANDARD_GRAVITY_M_S2,
     FtSensor,
-    FtSpecification,
     ToolPayload,
 )
 from tactile_resonance.simulation.ur5e.kinematics import _at_origin
@@ -32,10 +31,9 @@ def assert_deviation(samples: np.ndarray, sigma: np.ndarray) -> None:
 
 
 def test_offset_and_repeatability_follow_the_data_sheet_as_read():
-    specification = FtSpecification()
     first = []
     for seed in range(400):
-        sensor = FtSensor(specification, np.random.default_rng(seed))
+        sensor = FtSensor(np.random.default_rng(seed))
         first.append(sensor.error())
     # accuracy 4.0 N, 0.3 N m and precision 3.5 N, 0.2 N m at two standard deviations
     total = np.hypot([2.0] * 3 + [0.15] * 3, [1.75] * 3 + [0.1] * 3)
@@ -43,7 +41,7 @@ def test_offset_and_repeatability_follow_the_data_sheet_as_read():
 
 
 def test_noise_is_white_beside_a_slow_drift():
-    sensor = FtSensor(FtSpecification(), np.random.default_rng(11))
+    sensor = FtSensor(np.random.default_rng(11))
     samples = [sensor.error() for _ in range(4001)]
     # differences of disjoint pairs: twice the white variance, the drift of 2 ms is negligible
     pairs = np.diff(np.array(samples), axis=0)[::2]

@@ -175,7 +175,7 @@ def test_a_motion_of_the_tool_is_that_of_the_joints_and_torques_do_the_same_work
         twist = posture.twist(point, qd)
         near = floats(q + 1e-3)
         found, speeds, away = posture_at(
-            kinematics.motion_to(*posture.tool(TCP), twist, near, np.pi * 2, *TCPS)
+            kinematics.motion_to(*posture.tool(TCP), twist, near, *TCPS)
         )
         np.testing.assert_allclose(found.q, q, atol=1e-8)
         np.testing.assert_allclose(matrix(found.flange), matrix(posture.flange), atol=1e-9)
@@ -201,8 +201,7 @@ def test_a_twist_comes_nearer_to_its_goal_and_the_tool_moves_by_the_mean_of_both
             way[:3] *= size / np.linalg.norm(way[:3])
             way[3:] *= 0.5 * size / np.linalg.norm(way[3:])
             motion = kinematics.motion_towards(
-                *(floats(q), qd, floats(before + way), most, period_s, straight),
-                *(np.pi * 2, np.pi, *TCPS),
+                floats(q), qd, floats(before + way), most, period_s, straight, *TCPS
             )
             found, speeds, away = posture_at(motion)
             assert away < 0.1

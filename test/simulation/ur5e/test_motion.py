@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
 from tactile_resonance.simulation.ur5e import motion
+from tactile_resonance.simulation.ur5e.kinematics import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from tactile_resonance.simulation.ur5e.motion import Trapezoid
 from tactile_resonance.simulation.ur5e.poses import ZERO, transform_from_pose
 from tactile_resonance.simulation.ur5e.target import (
+    BRAKE_RAD_S2,
     CYCLE_S,
-    MotionLimits,
+    TOOL_SPEED_M_S,
     ProtectiveStop,
     ScriptError,
     Target,
@@ -61,7 +63,7 @@ class Trace:
 
 @pytest.fixture
 def target() -> Target:
-    made = Target(floats(START), MotionLimits())
+    made = Target(floats(START))
     made.tcp = transform_from_pose([0.01, 0.02, 0.12, 0.1, -0.2, 0.3])
     return made
 
@@ -108,9 +110,9 @@ def test_movej_lowers_its_speed_to_the_limits_of_joints_and_tool(target):
     goal = START.copy()
     goal[0] += 3.0
     trace = Trace(target, motion.movej(target, floats(goal), 40.0, 20.0))
-    assert np.abs(trace.qd).max() <= target.limits.joint_speed_rad_s
+    assert np.abs(trace.qd).max() <= JOINT_SPEED_RAD_S
     tool_speed = np.linalg.norm(trace.twist[:, :3], axis=1)
-    assert 0.9 * target.limits.tool_speed_m_s < tool_speed.max() <= target.limits.tool_speed_m_s
+    assert 0.9 * TOOL_SPEED_M_S < tool_speed.max() <= TOOL_SPEED_M_S
     goal[5] += 3.0
     trace = Trace(target, motion.movej(target, floats(goal), 40.0, 20.0))
     assert np.abs(trace.qd).max() == pytest.approx(np.pi, rel=1e-9)
@@ -163,8 +165,8 @@ def test_speedl_ramps_straight_to_its_twist_and_stops_within_v2_over_2a(target):
     np.testing.assert_allclose(np.cross(travelled, twist[:3]), 0, atol=1e-12)
 
 
-def test_speedl_takes_its_time_and_no_more_than_the_tool_speed(target):
-    target.limits = MotionLimits(tool_speed_m_s=0.3)
+def test_speedl_takes_its_time_and_no_more_than_the_tool_speed(target, monkeypatch):
+    monkeypatch.setattr(motion, "TOOL_SPEED_M_S", 0.3)
     trace = Trace(target, motion.speedl(target, [0, 0, -4.0, 0, 0, 0], 20.0, 0.09))
     assert trace.cycles == 45
     np.testing.assert_allclose(target.twist, [0, 0, -0.3, 0, 0, 0], atol=1e-12)
@@ -202,13 +204,13 @@ def test_a_path_out_of_reach_stops_before_a_joint_passes_its_speed(target):
             target.begin_cycle()
             next(move)
             fastest = max(fastest, np.abs(target.qd).max())
-    assert 0.25 < fastest <= target.limits.joint_speed_rad_s * (1 + 1e-6)
+    assert 0.25 < fastest <= JOINT_SPEED_RAD_S * (1 + 1e-6)
 
 
 def test_a_joint_does_not_pass_its_range(target):
     with pytest.raises(ProtectiveStop, match="beyond its range"):
         Trace(target, motion.speedj(target, [0, 0, 0, 0, 0, 3.0], 10.0, 5.0))
-    assert np.abs(target.q).max() <= target.limits.joint_range_rad
+    assert np.abs(target.q).max() <= JOINT_RANGE_RAD
 
 
 def test_two_threads_cannot_move_the_arm_at_once(target):
@@ -253,6 +255,6 @@ def test_nobody_in_command_the_arm_brakes(target):
     while any(target.qd):
         target.begin_cycle()
         target.end_cycle()
-        assert target.qdd[0] >= -target.limits.brake_rad_s2 * (1 + 1e-9)
-    way = 0.5**2 / (2 * target.limits.brake_rad_s2)
+        assert target.qdd[0] >= -BRAKE_RAD_S2 * (1 + 1e-9)
+    way = 0.5**2 / (2 * BRAKE_RAD_S2)
     np.testing.assert_allclose(target.q - before, [way, 0, 0, 0, 0, 0], atol=1e-4)
