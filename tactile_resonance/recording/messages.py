@@ -24,7 +24,7 @@ from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.multisine import Excitation, Grid
-from tactile_resonance.poles.result import Poles, PolesStatus
+from tactile_resonance.poles.result import STATUS_CODE, Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
 from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
 from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
@@ -33,18 +33,7 @@ from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
 GRIDS = {Grid.CUSTOM: 0, Grid.FULL: 1, Grid.ODD: 2, Grid.ODD_RANDOM: 3}
 INPUT_KINDS = {InputKind.MEASURED: 0, InputKind.COMMANDED: 1}
 BETWEEN_SAMPLES = {BetweenSamples.BAND_LIMITED: 0, BetweenSamples.ZERO_ORDER_HOLD: 1}
-POLES_STATUS = {
-    PolesStatus.OK: 0,
-    PolesStatus.MODEL_ERROR: 1,
-    PolesStatus.NOT_CONVERGED: 2,
-    PolesStatus.TOO_FEW_LINES: 3,
-    PolesStatus.ILL_CONDITIONED: 4,
-    PolesStatus.UNSTABLE_POLE: 5,
-    PolesStatus.NO_COVARIANCE: 6,
-    PolesStatus.NO_RESONANCE: 7,
-    PolesStatus.FAILED: 8,
-    PolesStatus.TRUTH: 100,
-}
+POLES_STATUS = {**STATUS_CODE, PolesStatus.TRUTH: 100}
 
 
 def plain(kind: type) -> tuple[str, ...]:

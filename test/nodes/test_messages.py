@@ -211,14 +211,15 @@ def test_unknown_position_is_an_empty_frame():
 
 
 def test_every_status_has_its_constant():
-    for table in (
-        stored.GRIDS,
-        stored.INPUT_KINDS,
-        stored.BETWEEN_SAMPLES,
-        messages.FRF_STATUS,
-        stored.POLES_STATUS,
+    for table, kind, prefix in (
+        (stored.GRIDS, msg.Excitation, "GRID_"),
+        (stored.INPUT_KINDS, msg.Record, "INPUT_"),
+        (stored.BETWEEN_SAMPLES, msg.Record, ""),
+        (messages.FRF_STATUS, msg.FRF, "STATUS_"),
+        (stored.POLES_STATUS, msg.Poles, "STATUS_"),
     ):
         assert len(set(table.values())) == len(table) == len(type(next(iter(table))))
+        assert all(getattr(kind, prefix + key.name) == number for key, number in table.items())
     message = messages.poles_to_message(Poles(), Origin())
     message.status = 77
     with pytest.raises(ValueError, match="status: 77, accepted are"):
