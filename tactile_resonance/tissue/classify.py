@@ -80,7 +80,7 @@ def class_from_samples(name: str, points: npt.ArrayLike, prior: float = 1.0) -> 
     require(good, "points", x.shape, "shape (n, 2) with n at least 4, finite")
     n, scatter = len(x), np.cov(x.T)
     # equal or rounded figures: no spread was measured, and whatever is not on their line would be unknown
-    shown = bool(np.all(np.ptp(x, axis=0) > 0)) and np.linalg.det(scatter / _unit(scatter)) > _LEAST_SCATTER
+    shown = bool(np.all(np.ptp(x, axis=0) > 0)) and np.linalg.det(np.corrcoef(x.T)) > _LEAST_SCATTER
     require(shown, "points", x[:4].tolist(), "points that scatter in f0 and in damping ratio, not on one line")
     return predictive_class(name, x.mean(axis=0), (1 + 1 / n) * scatter, n - 1.0, prior)
 
@@ -206,10 +206,3 @@ def _density_and_tail(
             special.fdtrc(2, dof, distance2 / 2),
         )
     return np.asarray(log_shape - log_volume - np.log(2 * np.pi)), np.asarray(tail)
-
-
-def _unit(covariance: FloatArray) -> FloatArray:
-    """Outer product of the standard deviations, 1 where they vanish."""
-    std = np.sqrt(np.maximum(np.diag(covariance), 0))
-    std = np.where(std > 0, std, 1.0)
-    return np.outer(std, std)
