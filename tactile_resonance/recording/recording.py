@@ -343,7 +343,7 @@ def read_recording(
     if sample_rate_hz is None:
         sample_rate_hz = _sample_rate(fields, path, np.shape(fields[u]))
     if samples_per_period is None and "samples_per_period" in fields:
-        samples_per_period = whole(_scalar(fields, "samples_per_period"), "samples_per_period", 4)
+        samples_per_period = whole(np.squeeze(fields["samples_per_period"]), "samples_per_period", 4)
     if excited_harmonics is None:
         excited_harmonics = fields.get("excited_harmonics")
     return make_recording(
@@ -361,7 +361,9 @@ def read_recording(
 
 def _sample_rate(fields: Mapping[str, np.ndarray], path: Path, shape: tuple[int, ...]) -> float:
     """Of a channel of that shape; times may be those of all of it, or of its last axes."""
-    rate_hz = _scalar(fields, "sample_rate_hz") if "sample_rate_hz" in fields else None
+    rate_hz = None
+    if "sample_rate_hz" in fields:
+        rate_hz = number(np.squeeze(fields["sample_rate_hz"]), "sample_rate_hz")
     if "time_s" in fields:
         time_s = np.ravel(fields["time_s"])
         sizes = np.cumprod(shape[::-1], dtype=int).tolist() or [1]
@@ -382,10 +384,3 @@ def _sample_rate(fields: Mapping[str, np.ndarray], path: Path, shape: tuple[int,
     if rate_hz is not None:
         return rate_hz
     raise ValueError(f"sample_rate_hz: missing in {path.name}, expected there or given")
-
-
-def _scalar(fields: Mapping[str, np.ndarray], name: str) -> float:
-    value = np.ravel(fields[name])
-    if value.size != 1 or value.dtype.kind not in "iuf" or not np.isfinite(value[0]):
-        raise ValueError(f"{name}: {np.array2string(value, threshold=5)}, expected one number")
-    return float(value[0])
