@@ -28,7 +28,6 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance.fields import read
-from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.result import BandBins, band_bins
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.scan.point_result import PointResult
@@ -161,10 +160,8 @@ def bins_of_point(
     try:
         recording = recording_of_point(run, result)
         record, harmonics = Spectrum.of(recording.u, recording.y), recording.excited_harmonics
-        rate_hz = recording.sample_rate_hz
-        if harmonics is None:
-            harmonics = find_excited_harmonics(record)
-        bins = band_bins(record, harmonics, sample_rate_hz=rate_hz, band_hz=band_hz)
+        assert harmonics is not None  # the store's recordings know them
+        bins = band_bins(record, harmonics, sample_rate_hz=recording.sample_rate_hz, band_hz=band_hz)
     except ValueError as error:
         return f"{name}: {error}"
     if bins is None:

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from tactile_resonance.fields import read_text, read_yaml, require
-from tactile_resonance.frf.excited import find_excited_harmonics
 from tactile_resonance.frf.spectra import Spectrum
 from tactile_resonance.scan.point_result import PointKind, PointResult
 from tactile_resonance.scan.recorded import recording_of_point
@@ -223,8 +222,7 @@ def labelled_frfs(
                 left_out[str(error)] += 1
                 continue
             harmonics = recording.excited_harmonics
-            if harmonics is None:
-                harmonics = find_excited_harmonics(spectrum)
+            assert harmonics is not None  # the store's recordings know them
             lines_hz = harmonics * recording.resolution_hz
             if not frequency_hz.size:
                 frequency_hz = lines_hz
