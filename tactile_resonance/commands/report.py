@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
-import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -145,25 +145,13 @@ def listen(options: argparse.Namespace) -> int:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     live = LiveRun(lambda name, data: server.publish(name, data))
     server = LiveServer(options.port, live.snapshot)
-    ended, failed = threading.Event(), list[Exception]()
-
-    def tick() -> None:
-        try:
-            while not ended.wait(EACH_S):
-                if server.readers:
-                    live.tick()
-        except Exception as error:
-            # raised again below: a page that stands still would seem to be live
-            failed.append(error)
-
+    told_s = 0.0
     with noting_signals() as check, server, LiveListener(live, options.namespace) as listener:
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         print(f"{server.url} shows the nodes of ROS_DOMAIN_ID={domain}; Ctrl-C ends it", flush=True)
-        threading.Thread(target=tick, daemon=True).start()
-        try:
-            while not failed:
-                check()
-                listener.spin(EACH_S)
-            raise failed[0]
-        finally:
-            ended.set()
+        while True:
+            check()
+            listener.spin(EACH_S)
+            if server.readers and time.monotonic() - told_s > EACH_S:
+                live.tick()
+                told_s = time.monotonic()
