@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -16,7 +17,7 @@ from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import uninstall_signal_handlers
 
 from tactile_resonance.drivers.acquisition import DeviceError
@@ -31,40 +32,34 @@ STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """This machine's clock, for timers that must go on while simulated time stands."""
 
 
-def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
-    return QoSProfile(
-        depth=depth,
-        history=HistoryPolicy.KEEP_LAST,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
+# Of rclpy's own profile: the last `depth` messages, reliable, and nothing for late readers.
+_latched = partial(QoSProfile, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_unreliable = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
 # Records and results: every one counts. A depth of 256 is a hundred seconds of periods of 0.4 s.
-RESULTS = _qos(256)
+RESULTS = QoSProfile(depth=256)
 # Static metadata and maps: late readers get the last one.
-LATCHED = _qos(1, latched=True)
+LATCHED = _latched(depth=1)
 # Excitations: late readers get those of the measurement under way, however many realisations it has.
-EXCITATIONS = _qos(64, latched=True)
+EXCITATIONS = _latched(depth=64)
 # Truths: one with each block, and those of two blocks may leave the bench together.
-TRUTHS = _qos(64, latched=True)
+TRUTHS = _latched(depth=64)
 # Poles: small, and a map that is started or restarted in mid-scan gets those it missed.
-POLES = _qos(1024, latched=True)
+POLES = _latched(depth=1024)
 # What became of the points: late readers get all of a scan.
-POINT_RESULTS = _qos(4096, latched=True)
+POINT_RESULTS = _latched(depth=4096)
 # The same from now on: of a run that is resumed all come at once.
-NEW_POINT_RESULTS = _qos(POINT_RESULTS.depth)
+NEW_POINT_RESULTS = QoSProfile(depth=POINT_RESULTS.depth)
 # Poses and wrenches: the newest counts.
-STREAM = _qos(5, reliable=False)
-NEWEST = _qos(1, reliable=False)
+STREAM = _unreliable(depth=5)
+NEWEST = _unreliable(depth=1)
 # Where the tip is put, by those who put it there: the bench must hear it before it plays.
-PLACES = _qos(5)
+PLACES = QoSProfile(depth=5)
 # To a controller: only the newest counts, and it must arrive.
-COMMANDS = _qos(1)
+COMMANDS = QoSProfile(depth=1)
 # Of a recording, and from a sensor of another driver: what is published at 50 Hz may wait two seconds.
-SERIES = _qos(100, reliable=False)
+SERIES = _unreliable(depth=100)
 # Signs of life.
-BEATS = _qos(10, reliable=False)
+BEATS = _unreliable(depth=10)
 
 
 STDERR = 2  # its descriptor
