@@ -197,9 +197,11 @@ def _sample(pid: int, wall_s: float, finished: int) -> Sample:
 
 def _name(words: list[str]) -> str:
     """Of a process: its node, or what the command line says it runs."""
+    if node := re.search(r"tactile_resonance\.nodes\.(\w+)", " ".join(words)):
+        return node[1]
     if "-m" in words:
         module = words[words.index("-m") + 1].rpartition(".")[2]
-        return module if module.endswith("_node") else f"{module} {words[words.index('-m') + 2]}"
+        return f"{module} {words[words.index('-m') + 2]}"
     return " ".join(Path(word).name for word in words if word)[:40]
 
 

@@ -57,10 +57,10 @@ class NodeProcesses:
     def start(
         self, node: str, parameters: Mapping[str, object] | None = None, niceness: int = 0
     ) -> None:
-        """Start ``python -m tactile_resonance.nodes.<node>`` with parameters of its own; see `start_child`."""
-        module = f"tactile_resonance.nodes.{node}"
+        """Start a node as its console script does, with parameters of its own; see `start_child`."""
+        program = f"from tactile_resonance.nodes.{node} import main; main()"
         nice = ["nice", "-n", str(niceness)] if niceness else []
-        command = [*nice, *self._prefix, sys.executable, "-m", module, "--ros-args"]
+        command = [*nice, *self._prefix, sys.executable, "-c", program, "--ros-args"]
         for name, value in (parameters or {}).items():
             command += ["-p", f"{name}:={json.dumps(value, default=str)}"]  # JSON is YAML
         self._log_folder.mkdir(parents=True, exist_ok=True)

@@ -417,6 +417,3 @@ class ContactNode(ManagedNode):
 
 
 main = ContactNode.run
-
-if __name__ == "__main__":
-    main()

@@ -412,7 +412,3 @@ def main() -> None:
     # the thread that reads the device takes over from that of the executor within this, and not 5 ms
     sys.setswitchinterval(1e-5)
     ExcitationNode.run()
-
-
-if __name__ == "__main__":
-    main()

@@ -366,6 +366,3 @@ class FakeHardwareNode(ManagedNode):
 
 
 main = FakeHardwareNode.run
-
-if __name__ == "__main__":
-    main()

@@ -130,6 +130,3 @@ class FrfNode(ManagedNode):
 
 
 main = FrfNode.run
-
-if __name__ == "__main__":
-    main()

@@ -234,7 +234,3 @@ class ManagerNode(Node):
 def main() -> None:
     """Console script."""
     run_node(ManagerNode)
-
-
-if __name__ == "__main__":
-    main()

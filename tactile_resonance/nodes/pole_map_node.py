@@ -350,6 +350,3 @@ def _boundary_of(
 
 
 main = PoleMapNode.run
-
-if __name__ == "__main__":
-    main()

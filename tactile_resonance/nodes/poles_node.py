@@ -105,6 +105,3 @@ class PolesNode(ManagedNode):
 
 
 main = PolesNode.run
-
-if __name__ == "__main__":
-    main()

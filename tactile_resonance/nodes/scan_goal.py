@@ -98,7 +98,3 @@ def main() -> None:
     except (NoAnswer, *UNUSABLE) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()

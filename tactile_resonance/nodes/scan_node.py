@@ -326,6 +326,3 @@ def _new_file(name: str) -> BinaryIO:
 
 
 main = ScanNode.run
-
-if __name__ == "__main__":
-    main()
