@@ -229,7 +229,7 @@ def _solution(
         if determined and np.isfinite(column).all() and (column > 0).all():
             half = vh.T / singular
             inverse = half @ half.T / np.outer(scale, scale)
-            # as in `likelihood.invert`
+            # see `Solution.condition`
             condition = float((np.sum(singular**4) * np.sum(singular**-4.0)) ** 0.25)
     free = max(len(rows) - theta.size, 1)
     whole = ROUNDING**2 * float(np.sum(np.abs(data.y[0][:, data.order]) ** 2 / data.variance[0]))

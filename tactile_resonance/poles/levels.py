@@ -23,7 +23,7 @@ from scipy import special
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData
-from tactile_resonance.poles.likelihood import Solution, half_inverse, invert, moments, sandwich
+from tactile_resonance.poles.likelihood import Solution, half_inverse, moments, sandwich
 from tactile_resonance.poles.model import real_rows
 from tactile_resonance.poles.noise_level import (
     CHANCE,
@@ -182,7 +182,8 @@ def _taken_by_transients(plan: JointPlan, solution: Solution, variance: FloatArr
     of_a, _, basis = plan.problem.driven_bases
     size = plan.problem.split(solution.theta[:, 0])[0] @ of_a.T
     blocks = solution.normal[..., a + b :, a + b :].sum(axis=2)
-    inverse = invert(blocks.reshape(-1, own, own))[0].reshape(blocks.shape).sum(axis=1)
+    half = half_inverse(blocks.reshape(-1, own, own)).reshape(blocks.shape)
+    inverse = (half.swapaxes(-1, -2) @ half).sum(axis=1)
     products = np.real(basis.conj()[:, :, None] * basis[:, None, :]).reshape(-1, own * own)
     return (inverse.reshape(-1, own * own) @ products.T) / (
         variance * (size.real**2 + size.imag**2)

@@ -130,7 +130,8 @@ class Solution(NamedTuple):
         Blocks of the inverse of the normal matrix: of the coefficients that records share and those of one;
         NaN where it is singular or not finite.
     condition : (points,) float
-        See `invert`.
+        Root of the Frobenius condition number of the normal matrix with unit diagonal: that of a Jacobian with
+        unit columns, within a factor n. Infinite where there is no inverse.
     leverage : (points, 2) float
         Real coefficients that go to undriven and to driven bins.
     noise : (points, 2) float
@@ -187,7 +188,8 @@ class Solution(NamedTuple):
         """(points, s + M c, s + M c) of the normal matrix of all coefficients; NaN where `marginal` is."""
         if self.theta.shape[1] == 1:
             return self.marginal[:, 0]
-        return invert(_of_all(self.normal.sum(axis=2), shared))[0]
+        half = half_inverse(_of_all(self.normal.sum(axis=2), shared))
+        return half.swapaxes(-1, -2) @ half
 
     def sandwich(self, normal: FloatArray, shared: int) -> FloatArray:
         """(points, s, s) of the shared coefficients, of gradients with covariances (points, M, n, n)."""
@@ -861,7 +863,7 @@ def _residuals(tables, work, which, first, residual):
 
 @inner
 def _inverted(matrix, inverse, scale, row):
-    """Write the inverse of a positive definite matrix; its condition number: see `invert`."""
+    """Write the inverse of a positive definite matrix; return what `Solution.condition` is of it."""
     n = matrix.shape[0]
     before = 0.0
     for i in range(n):
@@ -902,31 +904,6 @@ def _inverted(matrix, inverse, scale, row):
         inverse[:] = np.nan
         return np.inf
     return np.sqrt(condition)
-
-
-def invert(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverses (batch, n, n) of positive definite matrices, and condition numbers of their roots.
-
-    Returns
-    -------
-    inverse : (batch, n, n) float
-        NaN where a matrix is singular to rounding, or not finite.
-    condition : (batch,) float
-        Root of the Frobenius condition number with unit diagonal: that of a Jacobian with unit columns,
-        within a factor n. Infinite where there is no inverse.
-    """
-    inverses, conditions = np.empty(matrices.shape), np.empty(len(matrices))
-    _invert(matrices, inverses, conditions)
-    return inverses, conditions
-
-
-@entry
-def _invert(matrices, inverses, conditions):
-    """Put what `invert` gives into the last two."""
-    batch, n = matrices.shape[0], matrices.shape[1]
-    scale, row = np.empty(n), np.empty(n)
-    for k in range(batch):
-        conditions[k] = _inverted(matrices[k], inverses[k], scale, row)
 
 
 @inner
