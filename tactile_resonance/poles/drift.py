@@ -224,7 +224,7 @@ class DriftingModes:
     @cached_property
     def _decay(self) -> ComplexArray:
         """(K,) the free decay from the start of the record."""
-        plan, theta, terms = self.plan, self.theta, self.plan.first_transient_terms
+        plan, theta, terms = self.plan, self.theta, self.plan.structure.transient_terms
         a, b, _ = plan.problem.sizes
         alpha = np.append(theta[:a], 1.0)
         decay = np.zeros(self._s.size, complex)

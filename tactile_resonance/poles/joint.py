@@ -56,10 +56,6 @@ class JointPlan(FitPlan):
     band_hz : (low, high)
     structure : ModelStructure, optional
         One mode and six residual terms when absent.
-    transient_terms : int, optional
-        Coefficients of the transient's numerator. When absent those of the model's own modes and of
-        as many residual terms as suit the structure: the transients of modes outside the band are
-        smooth over it, as their responses are.
     input_noise_ratio : float, optional
         Variance of the noise on a bin of U over that on a bin of Y. Needed for one period only:
         with several it is estimated.
@@ -85,17 +81,14 @@ class JointPlan(FitPlan):
     harmonics: IntArray | None
     band_hz: tuple[float, float]
     structure: ModelStructure = field(default_factory=ModelStructure)
-    transient_terms: int | None = None
     input_noise_ratio: float | None = None
     left_out: tuple[int, ...] = ()
     knocks_s: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("samples_per_period", "periods", "transient_terms"):
+        for name in ("samples_per_period", "periods"):
             value = getattr(self, name)
-            if not (name == "transient_terms" and value is None):
-                good = isinstance(value, Integral) and int(value) >= 1
-                require(good, name, value, "a whole number, at least 1")
+            require(isinstance(value, Integral) and value >= 1, name, value, "a whole number, at least 1")
         rate_hz = number(self.sample_rate_hz, "sample_rate_hz")
         require(rate_hz > 0, "sample_rate_hz", rate_hz, "a number above 0")
         band(self.band_hz, most_hz=rate_hz / 2)
@@ -233,11 +226,6 @@ class JointPlan(FitPlan):
         """(K, b) values of `numerator_basis` on all bins."""
         return self.numerator_basis.at(self.x, 0)[0]
 
-    @property
-    def first_transient_terms(self) -> int:
-        """Coefficients of the numerator of what decays from the start of the record."""
-        return self.structure.transient_terms if self.transient_terms is None else self.transient_terms
-
     @cached_property
     def transient_on_bins(self) -> ComplexArray:
         """(K, c) basis of the transient's numerator on all bins.
@@ -249,7 +237,7 @@ class JointPlan(FitPlan):
         """
         interval_s, order = 1 / self.sample_rate_hz, self.structure.order
         s = 2j * np.pi * self.frequency_hz
-        terms = self.first_transient_terms
+        terms = self.structure.transient_terms
         # a knock makes modes outside of the band ring too, and its instant is not known exactly
         most = max(terms, order + TERMS_OF_A_KNOCK)
         of_knock = PolynomialBasis.on_lines(np.exp(-s * interval_s), most - 1).values
@@ -289,7 +277,7 @@ class JointPlan(FitPlan):
     def with_structure(self, structure: ModelStructure) -> JointPlan | None:
         """The plan of another structure; None where the band holds too few lines for it."""
         try:
-            return replace(self, structure=structure, transient_terms=None)
+            return replace(self, structure=structure)
         except ValueError:
             return None
 
@@ -384,12 +372,7 @@ def whole_harmonics(harmonics: npt.ArrayLike) -> IntArray:
         If they are no whole numbers.
     """
     values = np.asarray(harmonics).ravel()
-    if values.size == 0:
-        return values.astype(np.int64)
-    whole = values.dtype.kind in "iu"
-    if values.dtype.kind == "f":
-        whole = bool(np.isfinite(values).all() and (values % 1 == 0).all())
-    if not whole:
+    if not (values.dtype.kind in "iuf" and (values % 1 == 0).all()):  # of NaN and infinity there is no rest
         raise ValueError(
             f"harmonics: {values[:5].tolist()}... of type {values.dtype}, expected whole multiples "
             "of the sample rate over the samples per period"

@@ -134,7 +134,6 @@ def test_a_bad_record_is_named(changes, said):
     [
         ({"periods": 2.5}, "periods: got 2.5"),
         ({"samples_per_period": 2000.5}, "samples_per_period: got 2000.5"),
-        ({"transient_terms": 2.5}, "transient_terms: got 2.5"),
     ],
 )
 def test_a_bad_plan_is_named(changes, said):

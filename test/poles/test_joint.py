@@ -188,7 +188,6 @@ def test_records_of_samples(shared_data):
         ({"band_hz": (249.0, 251.0)}, "band_hz"),
         ({"periods": 0}, "periods"),
         ({"input_noise_ratio": -1.0}, "input_noise_ratio"),
-        ({"transient_terms": 0}, "transient_terms"),
     ],
 )
 def test_bad_input_is_named(options, field):

@@ -144,7 +144,7 @@ def test_a_knock_at_the_start_is_the_transient():
     """No term is fitted twice, and those of the first transient stay what they are."""
     kind = (RATE_HZ, SAMPLES, PERIODS, HARMONICS, (200.0, 300.0))
     alone, same, later = (JointPlan(*kind, knocks_s=t) for t in ((), (0.0,), (0.5,)))
-    terms = alone.first_transient_terms
+    terms = alone.structure.transient_terms
     assert same.transient_on_bins.shape[1] == terms
     assert later.transient_on_bins.shape[1] == 2 * terms
     for plan in (same, later):

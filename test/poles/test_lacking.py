@@ -171,7 +171,7 @@ def response(frequency_hz, f0_hz, damping_ratio):
 def realisations(runs, records, periods, snr_db, beside=()):
     """Plan and bins u, y (runs, M, K) of a mode at 250 Hz and others, from any initial state."""
     kind = JointPlan if records == 1 else PoleEstimator
-    plan = kind(5e3, 2000, periods, np.arange(4, 401), (200.0, 300.0), transient_terms=8)
+    plan = kind(5e3, 2000, periods, np.arange(4, 401), (200.0, 300.0))
     hz, rng = plan.frequency_hz, np.random.default_rng(11)
     u = np.zeros((runs, records, hz.size), complex)
     phase = 2 * np.pi * rng.random((runs, records, plan.excited_at.size))
