@@ -131,7 +131,6 @@ class BenchRun:
     ) -> None:
         good = isinstance(seed, (int, np.integer)) and seed >= 0
         require(good, "seed", seed, "an integer, 0 or above")
-        self._coupled_at = coupled if callable(coupled) else None
         self.coupled = coupled(0.0) if callable(coupled) else coupled
         self.seed = seed
         self.effects = effects
@@ -141,12 +140,10 @@ class BenchRun:
         self._drive = ResponseStream(direct, delay_s=max(0.0, -skew))
         late_s, modal = max(0.0, skew), self.coupled.modal
         self._sensor: ResponseStream | NonlinearStream | VaryingStream
-        if self._coupled_at is not None:
+        if callable(coupled):
             off = not effects.nonlinearity
             require(off, "nonlinearity", True, "off while the contact changes")
-            self._sensor = VaryingStream(
-                self._coupled_at, delay_s=late_s, negligible_v=negligible_v
-            )
+            self._sensor = VaryingStream(coupled, delay_s=late_s, negligible_v=negligible_v)
         elif effects.nonlinearity:
             # only here: it loads numba
             from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
@@ -189,9 +186,8 @@ class BenchRun:
 
     def play(self, excitation: Excitation | Lines, periods: int) -> Iterator[Record]:
         """Yield the next periods of an excitation, a block each, which is made when asked for."""
-        lines = Lines.of(excitation)
         for _ in range(periods):
-            yield self.block(lines)
+            yield self.block(excitation)
 
     def _make_period(self, lines: Lines) -> tuple[FloatArray, FloatArray]:
         """Drive and sensor voltage over one period."""
@@ -203,36 +199,29 @@ class BenchRun:
         disturbance = self._disturbance(lines.sample_rate_hz, samples)
         self._index += 1
         self._samples += samples
-        return _sum(drive, drive_noise), _sum(clean, disturbance, noise)
+        return drive + drive_noise, clean + disturbance + noise
 
     def _channel(self, volts: FloatArray, scale_v: float) -> Channel:
         if self.effects.quantisation:
             return convert(volts, scale_v, self._acquisition.adc_bits)
         return Channel(volts)
 
-    def _noise(self, channel: int, rms_v: float, samples: int) -> FloatArray | None:
+    def _noise(self, channel: int, rms_v: float, samples: int) -> FloatArray | float:
         """Return noise that depends on seed, realisation, period and channel only."""
         if rms_v == 0.0:
-            return None
+            return 0.0
         key = (channel, self._realisation, self._index)
         sequence = np.random.SeedSequence(self.seed, spawn_key=key)
         return rms_v * np.random.Generator(np.random.SFC64(sequence)).standard_normal(samples)
 
-    def _disturbance(self, sample_rate_hz: float, samples: int) -> FloatArray | None:
+    def _disturbance(self, sample_rate_hz: float, samples: int) -> FloatArray | float:
         effects = self.effects
         if effects.hum_v == effects.offset_v == effects.drift_v_per_s == 0.0:
-            return None
+            return 0.0
         time_s = (self._samples + np.arange(samples)) / sample_rate_hz
         phase = 2 * np.pi * effects.hum_frequency_hz * time_s + self.hum_phase_rad
         hum = np.sqrt(2) * effects.hum_v * np.cos(phase)
         return np.asarray(hum + effects.offset_v + effects.drift_v_per_s * time_s)
-
-
-def _sum(signal: FloatArray, *added: FloatArray | None) -> FloatArray:
-    """A signal and what is added to it; None adds nothing, and costs nothing."""
-    for part in added:
-        signal = signal if part is None else signal + part
-    return signal
 
 
 @dataclass(frozen=True)
