@@ -1,21 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands of the RTDE client: those that move the arm, those that set something, and those that ask."""
+"""The program that serves an RTDE client: how it waits for commands, and what each of them does.
+
+The client uploads a URScript program that waits for command numbers in an input register. The
+simulated controller does not interpret URScript; it runs this loop, which keeps the same protocol:
+command in integer input 0, output 0 says 1 (ready) or 2 (done), results in integer output 1 and double
+outputs 0 to 5, progress of asynchronous motions in integer output 2. All numbers are shifted by 24
+where the program was made for the upper range.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
 from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
 from tactile_resonance.simulation.ur5e import motion
-from tactile_resonance.simulation.ur5e.command_loop import Command, CommandLoop
 from tactile_resonance.simulation.ur5e.forces import ForceTask, ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture, product
 from tactile_resonance.simulation.ur5e.machine import Machine
-from tactile_resonance.simulation.ur5e.poses import Six, pose_from_transform
+from tactile_resonance.simulation.ur5e.poses import (
+    Six,
+    Transform,
+    pose_from_transform,
+    transform_from_pose,
+)
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError, Thread
-from tactile_resonance.simulation.ur5e.variables import Registers
+from tactile_resonance.simulation.ur5e.variables import (
+    DOUBLE_INPUTS,
+    INT_INPUTS,
+    LARGEST_FIGURE,
+    Registers,
+)
+
+# Commands that are done anew in every cycle in which they stand in the command register.
+STREAMING = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58})
+
+READY, DONE = 1, 2
+STOP_SCRIPT = 255
+
+# An asynchronous motion's progress word: counters of 7 bits, then a flag, then 15 bits of progress.
+_COUNTER_SPAN = 128
+_RUNNING = 1 << 15
+
+
+Command = Callable[[], Thread | None]
+"""What a command does; a generator where that takes time."""
 
 # Force mode as the client's program sets it when it starts.
 _GAIN_SCALING, _DAMPING = 0.5, 0.025
@@ -29,8 +60,8 @@ MOVE_ACCELERATION, MOVE_SPEED = 1.2, 0.25
 JOG_STOP, FORCE_MODE_STOP = 1.2, 10.0
 
 
-class Program(CommandLoop):
-    """The client's program on an arm.
+class Program:
+    """The client's program on an arm: its registers, its threads and its loop.
 
     Parameters
     ----------
@@ -38,20 +69,147 @@ class Program(CommandLoop):
         The arm that it moves.
     registers : Registers
     offset : int
-        As `register_offset` returns it.
+        Added to all register numbers: 0 or 24.
+
+    Attributes
+    ----------
+    offset : int
+    threads : dict of str to generator
+        Running threads by name.
+    watchdog_s : float or None
+        Longest time without a refresh of the command register; None without a watchdog.
     """
 
     def __init__(self, machine: Machine, registers: Registers, offset: int) -> None:
-        super().__init__(registers, offset)
         machine.force_mode.gain_scaling = _GAIN_SCALING
         machine.force_mode.damping = _DAMPING
-        self._machine, self._target = machine, machine.target
+        self.offset = offset
+        self.threads: dict[str, Thread] = {}
+        self.watchdog_s: float | None = None
+        self._machine, self._target, self._registers = machine, machine.target, registers
+        self._internal_command = 0  # set by a thread for the main loop, where none of the client waits
+        self._progress_writes = self._operation = 0
         # linear or in the joints; the client's program sets this by asynchronous stops alone
         self._stop_linear = False
         # what threads do again and again, as it was asked for last, and with what arguments
         self._asked: dict[str, tuple[Callable[..., Thread], tuple]] = {"speed": (motion.speedl, ())}
         self._contact_steps = 0
-        self.commands = self._all_commands()
+        self._commands = self._all_commands()
+        self._main = self._loop()
+
+    def step(self) -> bool:
+        """Run one cycle, the main loop before the threads; False once the program has ended.
+
+        Raises
+        ------
+        ScriptError, ProtectiveStop
+            See `Target.command`; the program is over then.
+        """
+        try:
+            next(self._main)
+        except StopIteration:
+            return False
+        for name, thread in list(self.threads.items()):
+            if self.threads.get(name) is not thread:
+                continue  # ended by one that stepped before it
+            try:
+                next(thread)
+            except StopIteration:
+                self.kill(name)
+        return True
+
+    def _loop(self) -> Thread:
+        """Serve commands until the stop command: one look at the command register in each cycle.
+
+        A streaming command is done anew as long as it stands in the register; any other once, until
+        the client has taken it away.
+        """
+        self.tell_asynchronous(begins=False)
+        self.status(READY)
+        executing = False
+        while True:
+            command = self.integer(0)
+            if command == 0:
+                command, self._internal_command = self._internal_command, 0
+            if command in STREAMING:
+                yield from self._execute(command)
+                self.status(READY)
+            elif command == 0:
+                executing = False
+                self.status(READY)
+            elif not executing:
+                if command == STOP_SCRIPT:
+                    return
+                yield from self._execute(command)
+                self.status(DONE)
+                executing = True
+            yield
+
+    def _execute(self, command: int) -> Thread:
+        """Do a command; raises ScriptError where the model has none such, or refuses its arguments."""
+        if command not in self._commands:
+            raise ScriptError(f"command {command}: not modelled")
+        work = self._commands[command]()
+        if work is not None:
+            yield from work
+
+    def kill(self, name: str) -> bool:
+        """End a thread and say whether it was running."""
+        return self.threads.pop(name, None) is not None
+
+    def integer(self, number: int) -> int:
+        """Return an integer input register."""
+        return self._registers.inputs[INT_INPUTS[number + self.offset]]  # type: ignore[return-value]
+
+    def double(self, number: int) -> float:
+        """Return a double input register; raises as `doubles`."""
+        return self.doubles(number, 1)[0]
+
+    def vector(self, number: int) -> Vector:
+        """Return three double input registers; raises as `doubles`."""
+        x, y, z = self.doubles(number, 3)
+        return x, y, z
+
+    def pose(self, number: int = 0) -> Transform:
+        """Return the transform of a pose in six double input registers; raises as `doubles`."""
+        return transform_from_pose(self.doubles(number))
+
+    def doubles(self, number: int = 0, count: int = 6) -> tuple[float, ...]:
+        """Return double input registers.
+
+        Raises
+        ------
+        ScriptError
+            If one of them is not finite or beyond +-1e6.
+        """
+        first, inputs = number + self.offset, self._registers.inputs
+        values = tuple([inputs[name] for name in DOUBLE_INPUTS[first : first + count]])
+        if not (math.isfinite(sum(values)) and max(map(abs, values)) <= LARGEST_FIGURE):
+            raise ScriptError(
+                f"input_double_register_{first}...: {list(values)}; accepted are numbers within "
+                f"+-{LARGEST_FIGURE:g}"
+            )
+        return values
+
+    def status(self, value: int) -> None:
+        """Write the state of the command loop."""
+        self._registers.output_int[self.offset] = value
+
+    def answer(self, value: int) -> None:
+        """Write an integer result."""
+        self._registers.output_int[1 + self.offset] = int(value)
+
+    def answer_doubles(self, values: Iterable[float]) -> None:
+        """Write a vector result."""
+        for place, value in enumerate(values):
+            self._registers.output_double[place + self.offset] = value
+
+    def tell_asynchronous(self, *, begins: bool) -> None:
+        """Tell that an asynchronous operation begins, or that none runs."""
+        self._operation = (self._operation + begins) % _COUNTER_SPAN
+        self._progress_writes = (self._progress_writes + 1) % _COUNTER_SPAN
+        word = (self._operation << 24) + (self._progress_writes << 16) + begins * _RUNNING
+        self._registers.output_int[2 + self.offset] = word
 
     def _move(self, run: Callable[[Any, Any, float, float], Thread], goal: Any) -> Thread:
         """Move to joint angles or a pose."""
@@ -76,7 +234,7 @@ class Program(CommandLoop):
     def _done(self, name: str, work: Thread) -> Thread:
         """Execute a motion; in a thread if integer 1 is set, whose begin and end are reported to the client."""
         if self.integer(1) == 1:
-            self.run(name, self._told(work))
+            self.threads[name] = self._told(work)
         else:
             yield from work
 
@@ -89,7 +247,7 @@ class Program(CommandLoop):
         """Do a motion again and again; a newer one is taken up when the time of the last is over."""
         self._asked[name] = run, arguments
         if name not in self.threads:
-            self.run(name, self._kept(name))
+            self.threads[name] = self._kept(name)
 
     def _kept(self, name: str) -> Thread:
         while True:
@@ -140,7 +298,7 @@ class Program(CommandLoop):
     def _start_contact(self) -> None:
         """Watch for a contact along a direction."""
         self.kill("contact")
-        self.run("contact", self._watching(self.vector(0)))
+        self.threads["contact"] = self._watching(self.vector(0))
 
     def _watching(self, direction: Vector) -> Thread:
         """Wait until nothing is touched, then for a contact; zero: along the motion."""
@@ -156,7 +314,7 @@ class Program(CommandLoop):
         while (found := steps()) == 0:
             yield
         self._contact_steps = found
-        self.internal_command = CONTACT_FOUND
+        self._internal_command = CONTACT_FOUND
 
     def _stop_contact(self) -> None:
         """End watching; how many cycles ago a contact began, 0 for none."""

@@ -13,6 +13,7 @@ gains, the threshold of tool contact, servoj's gain, currents) the model's own s
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Mapping
 from enum import IntEnum
@@ -20,7 +21,6 @@ from enum import IntEnum
 import numpy as np
 
 from tactile_resonance.simulation.noise import Seed
-from tactile_resonance.simulation.ur5e.command_loop import register_offset
 from tactile_resonance.simulation.ur5e.commands import Program
 from tactile_resonance.simulation.ur5e.machine import Environment, Machine, MachineConfig
 from tactile_resonance.simulation.ur5e.poses import largest
@@ -214,7 +214,7 @@ class UrController:
         RefusedError
             Not in remote control, without power, or during a stop.
         """
-        offset = register_offset(text)
+        offset = _register_offset(text)
         if not self.remote_control:
             raise RefusedError("not in remote control: the program is ignored")
         if not self.may_move:
@@ -356,3 +356,22 @@ class UrController:
 
     def _note(self, line: str) -> None:
         self.log.append(f"{self.time_s:.3f} s {line}")
+
+
+def _register_offset(text: str) -> int:
+    """Return the register offset of a client's control program.
+
+    Raises
+    ------
+    ValueError
+        Where the text is not that program, or its offset is neither 0 nor 24.
+    """
+    if "def rtde_control():" not in text or not text.rstrip().endswith("end"):
+        raise ValueError(
+            f"program: got {text[:40]!r}...; accepted is a complete program 'def rtde_control():' ... "
+            "'end', as RTDE clients of ur_rtde upload it"
+        )
+    found = re.search(r"reg_offset_int\s*=\s*(?:#[^\n]*\n\s*)?(\d{1,9})", text)
+    if found is None or int(found[1]) not in (0, 24):
+        raise ValueError("program: reg_offset_int not found; accepted are offsets of 0 and 24")
+    return int(found[1])
