@@ -135,7 +135,7 @@ class Rig:
             seed=case.seed,
         )
         self.force_n: list[float] = []
-        bench.clock.on_step.append(lambda: self.force_n.append(float(bench.plant.force_n[2])))
+        bench.on_step.append(lambda: self.force_n.append(float(bench.plant.force_n[2])))
 
     def outcome(
         self, ready_n: int | None, cause: str, stated: tuple[float, float] | None = None
@@ -144,7 +144,7 @@ class Rig:
 
         `stated` is the mean force over the second after that, and its deviation, as reported.
         """
-        force, dt = np.array(self.force_n), self.bench.clock.motion.period_s
+        force, dt = np.array(self.force_n), self.bench.motion.period_s
         touched = int(np.argmax(force > 0)) if (force > 0).any() else 0
         if ready_n is None:
             return Outcome(np.inf, force.max() / FORCE_N - 1, np.nan, 0, cause)
@@ -192,7 +192,7 @@ def run_controller(
         force_rate_n_per_s=1.2 * max(setup.noise_n, 1e-3) / 1e-3,
     )
     controller = ContactController(parameters, limits)
-    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
+    loop = ContactLoop(bench.arm, bench.cell, bench, controller)
     loop.start(ContactGoal(rig.touch, Aim(FORCE_N)))
     loop.run_while(lambda: controller.result is None)
     ready = len(rig.force_n) if controller.state is State.HOLD else None
@@ -215,7 +215,7 @@ def stiff_peaks(count: int) -> np.ndarray:
         rig = Rig(Case(2.5e-3, 400e3, 1.0, 1e-3 + 2e-6 * seed, 0.0, seed), Setup("stiff"))
         bench = rig.bench
         controller = ContactController(ContactParameters(**KNOWN), Limits())
-        loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
+        loop = ContactLoop(bench.arm, bench.cell, bench, controller)
         loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))
         loop.run_while(lambda: True, 0.3)
         peaks.append(max(rig.force_n))
@@ -228,7 +228,7 @@ def contact_series(count: int) -> np.ndarray:
     bench = rig.bench
     parameters = ContactParameters(tare_s=0.2, **KNOWN)
     controller = ContactController(parameters, Limits())
-    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
+    loop = ContactLoop(bench.arm, bench.cell, bench, controller)
     means = []
     for _ in range(count):
         made = loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))

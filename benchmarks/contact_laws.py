@@ -154,13 +154,13 @@ LIVING_LAWS = {"admittance": Admittance, "PI": FixedPI}
 
 def steps_of(rig: Rig, law: Law, force_n: float = FORCE_N) -> Iterator[bool]:
     """Run a simple law on a bench, period by period; tell whether the force has been there for 50 ms."""
-    bench, dt = rig.bench, rig.bench.clock.motion.period_s
+    bench, dt = rig.bench, rig.bench.motion.period_s
     period_ns = round(1e9 * dt)
     forces: deque[float] = deque(maxlen=25)
     bias: list[float] = []
     within, stopped = 0, False
     for n in range(round(LONGEST_S / dt)):
-        bench.clock.wait_until((n + 1) * period_ns)
+        bench.wait_until((n + 1) * period_ns)
         tip = bench.arm.state().tip
         felt = bench.cell.mounting.to_tip(bench.cell.read(), vector(tip.position_m), tip.turn)
         samples = [float(sample.force_n[2]) for sample in felt]
@@ -189,7 +189,7 @@ def steps_of(rig: Rig, law: Law, force_n: float = FORCE_N) -> Iterator[bool]:
 def run_law(case: Case, setup: Setup, law: Law, record: list[float] | None = None) -> Outcome:
     """Run a simple law on a case; the true force of each period is appended to `record`."""
     rig = Rig(case, setup)
-    dt = rig.bench.clock.motion.period_s
+    dt = rig.bench.motion.period_s
     ready: int | None = None
     for now_ready in steps_of(rig, law):
         if ready is None and now_ready:

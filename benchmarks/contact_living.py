@@ -253,7 +253,7 @@ def drawn(row: Row, seed: int) -> tuple[Rig, float]:
                 # under the sample a press is a negative force
                 faults.bias_step_n = -rate * row.period_s * len(began)
 
-        rig.bench.clock.on_step.append(creep)
+        rig.bench.on_step.append(creep)
     # Johnson, Kendall & Roberts (1971)
     return rig, 1.5 * np.pi * work * radius_m
 
@@ -274,7 +274,7 @@ def _ours(row: Row, rig: Rig) -> Held:
     )
     limits = replace(Limits(depth_m=4.5e-3, approach_s=30.0), **row.limits)
     controller = ContactController(parameters, limits)
-    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
+    loop = ContactLoop(bench.arm, bench.cell, bench, controller)
     loop.start(ContactGoal(rig.touch, Aim(row.force_n)))
     loop.run_while(lambda: controller.result is None)
     at, ready = len(rig.force_n), controller.state is State.HOLD

@@ -24,7 +24,7 @@ from tactile_resonance.mechanics.prony import Prony
 from tactile_resonance.report.drawing import draw_tests, save_figure
 from tactile_resonance.scan.tissue_tests import TissueTest, fitted
 from tactile_resonance.sensor import sensor_named
-from tactile_resonance.simulation.plant.tissue_bench import indent_tissue
+from tactile_resonance.simulation.plant.contact_bench import indent_tissue
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 RADIUS_M, BEAM_N_PER_M, RATE_HZ = 2.5e-3, 14.8, 500.0

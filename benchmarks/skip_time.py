@@ -111,7 +111,7 @@ def point_times(skipping: Skipping, seed: int = 1) -> PointTimes:
         if cycle.state is State.HOLD:
             forces_n[-1].append(force_n)
 
-    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller, note)
+    loop = ContactLoop(bench.arm, bench.cell, bench, controller, note)
     standoffs = Standoffs(Plane())
     for point, touch in zip(points, touches, strict=True):
         spent.append(Counter())

@@ -161,7 +161,7 @@ def _mechanics(output: Path) -> None:
     from tactile_resonance.report.drawing import draw_tests, save_figure
     from tactile_resonance.scan.tissue_tests import fitted
     from tactile_resonance.sensor import sensor_named
-    from tactile_resonance.simulation.plant.tissue_bench import indent_tissue
+    from tactile_resonance.simulation.plant.contact_bench import indent_tissue
     from tactile_resonance.simulation.tissue.library import read_tissues
 
     library, sensor = read_tissues(), sensor_named("bimorph")

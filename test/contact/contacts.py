@@ -41,11 +41,11 @@ class Contact:
 
     def __post_init__(self):
         # a method, not a closure: a copy of the contact records into itself
-        self.bench.clock.on_step.append(self.record)
+        self.bench.on_step.append(self.record)
 
     def record(self):
         self.force_n.append(float(self.bench.plant.force_n[2]))
-        self.speed_m_s.append(float(self.bench.clock.motion.twist[2]))
+        self.speed_m_s.append(float(self.bench.motion.twist[2]))
 
     def run_until(self, state, longest_s=20.0):
         """Run until a state is reached; False where it is not."""
@@ -85,7 +85,7 @@ def contact(
     controller = ContactController(
         parameters, limits, under_sample=under_sample, calm_periods=calm_periods
     )
-    loop = ContactLoop(rig.arm, rig.cell, rig.clock, controller)
+    loop = ContactLoop(rig.arm, rig.cell, rig, controller)
     goal = ContactGoal(touch, Aim(FORCE_N) if aim is None else aim)
     return Contact(rig, controller, loop, goal)
 

@@ -80,17 +80,17 @@ def disturbed(tissue, **options):
     made = contact(tissue, **options)
     bench = made.bench
     arm, force = LyingArm(bench.arm), LyingForce(bench.cell)
-    made.loop = ContactLoop(arm, force, bench.clock, made.controller)
+    made.loop = ContactLoop(arm, force, bench, made.controller)
     rig = Disturbed(made, arm, force, [], [], [])
     touch = made.goal.touch
 
     def record():
-        motion = bench.clock.motion
+        motion = bench.motion
         rig.states.append(made.controller.state)
         rig.twists.append(motion.twist.copy())
         rig.heights_m.append(float(motion.reported.position_m[2] - touch.position_m[2]))
 
-    bench.clock.on_step.append(record)
+    bench.on_step.append(record)
     return rig
 
 

@@ -34,13 +34,13 @@ def goal(rig, x_m=0.0, standoff_m=np.inf, turn_rad=0.0):
 
 def height_m(rig):
     """Of the tip above the expected touch."""
-    return rig.bench.clock.motion.reported.position_m[2] - rig.goal.touch.position_m[2]
+    return rig.bench.motion.reported.position_m[2] - rig.goal.touch.position_m[2]
 
 
 def states(rig, aim):
     """States of one contact in their order, held for a moment and drawn back."""
     seen = []
-    note = rig.bench.clock.on_step
+    note = rig.bench.on_step
     note.append(lambda: seen.append(rig.controller.state))
     result = rig.loop.make(aim)
     rig.run(0.2)
@@ -94,7 +94,7 @@ def test_tip_rests_again_where_the_zero_is_not_known(why):
         assert rig.run_until(State.APPROACH)
         rig.loop.retract()
     if why == "long ago":
-        rig.bench.clock.wait_until(rig.bench.clock.now_ns() + 100_000_000_000)
+        rig.bench.wait_until(rig.bench.now_ns() + 100_000_000_000)
         rig.run(0.1)
     order, result, _ = states(rig, aim)
     assert State.TARE in order
@@ -125,7 +125,7 @@ def test_approach_begins_as_low_as_a_goal_asks_for_and_ends_there():
     rig = made()
     states(rig, goal(rig))
     travelled = []
-    rig.bench.clock.on_step.append(
+    rig.bench.on_step.append(
         lambda: rig.controller.state is State.TRAVEL and travelled.append(height_m(rig))
     )
     for x_m in (5e-3, 0.0):

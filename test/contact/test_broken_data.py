@@ -134,7 +134,7 @@ def test_forces_are_reported_while_no_state_of_the_arm_comes():
     """A supervisor may have to act on them."""
     made, told = contact(SOFT), []
     made.loop = ContactLoop(
-        made.bench.arm, made.bench.cell, made.bench.clock, made.controller, told.append
+        made.bench.arm, made.bench.cell, made.bench, made.controller, told.append
     )
     made.loop.make(made.goal)
     made.loop.run_while(lambda: True, 0.2)
@@ -158,7 +158,7 @@ def test_forces_are_reported_while_no_state_of_the_arm_comes():
 def test_tissue_that_rises_while_the_zero_is_taken_is_met_by_a_stop():
     # at 4 mm/s for up to half a second, as breathing does
     made = contact(stiffer(SOFT, 4.0), height_m=2.1e-3, start_m=2.2e-3)
-    made.bench.clock.on_step.append(
+    made.bench.on_step.append(
         lambda: lower(made.bench, -8e-6) if made.controller.state is State.TARE else None
     )
     made.loop.make(made.goal)
@@ -189,7 +189,7 @@ def test_estimate_that_errs_does_not_lead_deeper_than_search_and_depth_allow():
         model.surface_m, model._ln_c = rig.heights_m[-1] + 1e-4, math.log(800.0)
         model.surface_speed_m_s = 0.0
 
-    rig.bench.clock.on_step.append(sink)
+    rig.bench.on_step.append(sink)
     rig.run_until(State.FAULT, 7.0)
     assert rig.controller.result.cause is Cause.DEPTH
     rig.run(0.2)

@@ -150,9 +150,9 @@ def test_fault_of_the_arm_stops_the_tip_where_it_is(name, state):
     made.bench.arm.repair()
     made.bench.arm.connect()
     made.bench.cell.start()
-    place = made.bench.clock.motion.reported.position_m
+    place = made.bench.motion.reported.position_m
     made.run(0.1)
-    np.testing.assert_allclose(made.bench.clock.motion.reported.position_m, place, atol=1e-6)
+    np.testing.assert_allclose(made.bench.motion.reported.position_m, place, atol=1e-6)
     assert made.loop.retract().retracted
 
 
@@ -195,7 +195,7 @@ def test_missing_surface_ends_the_search_at_its_depth():
     made.run(0.3)
     assert result.cause is Cause.SURFACE_MISSING
     lowest = -contacts.QUICK.search_m
-    assert made.bench.clock.motion.reported.position_m[2] > contacts.RADIUS_M + lowest - 2e-4
+    assert made.bench.motion.reported.position_m[2] > contacts.RADIUS_M + lowest - 2e-4
 
 
 @pytest.mark.parametrize("tissue", [SOFT, stiffer(SOFT, 8.0)])
@@ -268,7 +268,7 @@ def test_arm_that_turns_on_the_spot_is_not_taken_to_stand():
     made = contact()
     arm = made.bench.arm
     arm.speed([0, 0, 0, 0, 0, 0.3], 2.0)
-    made.bench.clock.wait_until(300_000_000)
+    made.bench.wait_until(300_000_000)
     stop, stops = arm.stop, []
     arm.stop = lambda a: stop(a) if len(stops) > 3 else stops.append(a)  # the first ones are lost
     assert made.loop.bring_to_rest() == ""
@@ -298,7 +298,7 @@ def test_on_stiff_tissue_the_way_to_rest_costs_little_force(inject, state):
     assert made.run_until(state)
     if state is State.APPROACH:  # a few samples before the touch
         touch_m = contacts.RADIUS_M + 1e-3
-        position = made.bench.clock.motion
+        position = made.bench.motion
         made.loop.run_while(lambda: position.reported.position_m[2] > touch_m + 2e-5)
     inject(made)
     made.run(0.3)

@@ -29,7 +29,7 @@ def with_tip(tip, limits=None, **options):
     limits = Limits() if limits is None else limits
     made.controller = ContactController(QUICK, limits, tip)
     bench = made.bench
-    made.loop = ContactLoop(bench.arm, bench.cell, bench.clock, made.controller)
+    made.loop = ContactLoop(bench.arm, bench.cell, bench, made.controller)
     return made
 
 
@@ -82,9 +82,9 @@ def test_tip_that_dips_its_housing_in_the_approach_is_stopped():
     made.loop.start(made.goal)
     assert made.run_until(made.controller.state.APPROACH)
     made.controller._free._path.tip = FLAT
-    reported = made.bench.clock.motion.reported
+    reported = made.bench.motion.reported
     dipped = Rotation.from_rotvec([0.0, -0.1, 0.0]) * reported.rotation
-    made.bench.clock.motion.reported = Pose(reported.position_m, dipped.as_rotvec())
+    made.bench.motion.reported = Pose(reported.position_m, dipped.as_rotvec())
     made.run_until(made.controller.state.IDLE, 3.0)
     assert made.controller.result.cause is Cause.HOUSING
     assert "mm above the surface" in made.controller.result.message

@@ -174,9 +174,9 @@ def test_near_a_contact_that_succeeded_the_next_touch_is_fast():
     made = contact(stiffer(SOFT, 2.0), parameters=replace(QUICK, unknown_speed_m_s=3e-4))
     took_s = []
     for _ in range(2):
-        began_ns = made.bench.clock.time_ns
+        began_ns = made.bench.time_ns
         assert made.loop.make(made.goal).reached
-        took_s.append((made.bench.clock.time_ns - began_ns) * 1e-9)
+        took_s.append((made.bench.time_ns - began_ns) * 1e-9)
         made.run(0.1)
         assert made.loop.retract().retracted
     assert took_s[0] > 3 * took_s[1]

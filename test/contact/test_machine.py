@@ -53,7 +53,7 @@ def test_force_is_reached_held_and_reported_with_an_honest_deviation(tissue):
 def test_states_follow_each_other():
     made = contact()
     seen = []
-    made.bench.clock.on_step.append(lambda: seen.append(made.controller.state))
+    made.bench.on_step.append(lambda: seen.append(made.controller.state))
     made.loop.make(made.goal)
     made.run(0.1)
     made.loop.retract()
@@ -70,7 +70,7 @@ def test_all_six_axes_go_to_the_pose_of_the_point():
         np.array([0.02, -0.01, 0.0]), touch.rotation.as_matrix()[:, 2]
     )
     assert made.loop.make(ContactGoal(touch, Aim(FORCE_N))).reached
-    tip = made.bench.clock.motion.reported
+    tip = made.bench.motion.reported
     assert (touch.rotation * tip.rotation.inv()).magnitude() < 0.01
     normal = touch.rotation.as_matrix()[:, 2]
     way = tip.position_m - touch.position_m
@@ -82,9 +82,9 @@ def test_indentation_is_held_while_the_force_decays():
     made = contact(aim=Aim(FORCE_N, HoldMode.INDENTATION))
     assert made.loop.make(made.goal).reached
     made.run(0.2)
-    place, force = made.bench.clock.motion.reported.position_m[2], made.force_n[-1]
+    place, force = made.bench.motion.reported.position_m[2], made.force_n[-1]
     made.run(1.0)
-    assert made.bench.clock.motion.reported.position_m[2] == pytest.approx(place, abs=3e-6)
+    assert made.bench.motion.reported.position_m[2] == pytest.approx(place, abs=3e-6)
     assert made.force_n[-1] < 0.9 * force
 
 
@@ -266,7 +266,7 @@ def test_a_tip_that_leaves_the_way_of_its_goal_is_stopped(state, axis):
     made = started(start_m=0.1 if state is State.TRAVEL else 2.5e-3)
     assert made.run_until(state)
     made.run(0.05)
-    start = np.array(made.bench.clock.motion.reported.position_m)
+    start = np.array(made.bench.motion.reported.position_m)
     away = np.zeros(6)
     away[axis] = 0.1  # [m/s]: somebody else commands the arm
     obeys = made.bench.arm.speed
@@ -276,7 +276,7 @@ def test_a_tip_that_leaves_the_way_of_its_goal_is_stopped(state, axis):
     result = made.controller.result
     assert result.cause is Cause.WORKSPACE, result.message
     assert "off the way of its goal" in result.message
-    gone = made.bench.clock.motion.reported.position_m[axis] - start[axis]
+    gone = made.bench.motion.reported.position_m[axis] - start[axis]
     assert 0.045 < gone < 0.055
     made.bench.arm.speed, made.bench.arm.stop = obeys, stops
     assert made.run_until(State.IDLE, 3.0), "beside its way the tip is drawn back"
@@ -340,7 +340,7 @@ def test_stop_that_the_arm_did_not_hear_is_told_again():
 
     def stop(deceleration_m_s2):
         if made.controller.state is State.IDLE and not unheard:
-            unheard.append(made.bench.clock.time_ns)
+            unheard.append(made.bench.time_ns)
             raise ArmError(ArmFault.STALE, "the newest state is too old")
         hears(deceleration_m_s2)
 
@@ -358,9 +358,9 @@ def test_tip_left_pressing_beside_the_goal_is_lifted_before_it_goes_along():
     touch = made.goal.touch
     beside = ContactGoal(Pose(touch.position_m + [3e-3, 0, 0], touch.rotation_rad), made.goal.aim)
     controller = ContactController(QUICK, Limits())
-    loop = ContactLoop(made.bench.arm, made.bench.cell, made.bench.clock, controller)
+    loop = ContactLoop(made.bench.arm, made.bench.cell, made.bench, controller)
     way, since = [], len(made.force_n)
-    made.bench.clock.on_step.append(lambda: way.append(made.bench.plant.tip_m[0]))
+    made.bench.on_step.append(lambda: way.append(made.bench.plant.tip_m[0]))
     assert loop.make(beside).reached
     force = np.array(made.force_n[since:])
     lifted = int(np.argmax(force == 0))
@@ -374,7 +374,7 @@ def test_force_that_leaves_a_tip_left_pressing_is_no_touch():
     assert made.loop.make(made.goal).reached
     # a new controller knows nothing of that, and is to touch at the same place
     controller = ContactController(QUICK, Limits())
-    loop = ContactLoop(made.bench.arm, made.bench.cell, made.bench.clock, controller)
+    loop = ContactLoop(made.bench.arm, made.bench.cell, made.bench, controller)
     result = loop.make(made.goal)
     assert result.reached, result.message
 
@@ -384,7 +384,7 @@ def test_touch_told_by_noise_above_the_surface_is_no_early_surface(seed):
     # 0.2 mm above the tissue the cell shows 3 mN for 10 ms; the surface lies within what is accepted
     made = started(stiffer(SOFT, 2.0), height_m=1.5e-3, seed=seed, parameters=EARLY)
     assert made.run_until(State.APPROACH)
-    tip = made.bench.clock.motion
+    tip = made.bench.motion
     made.loop.run_while(lambda: tip.reported.position_m[2] - RADIUS_M > 1.7e-3)
     made.bench.cell.faults.bias_step_n = -3e-3
     made.run(0.01)
@@ -398,7 +398,7 @@ def test_touch_told_by_the_resonance_slows_the_rest_of_the_approach():
     made = started(height_m=0.0)
     assert not made.controller.tell_touch()  # not in an approach
     assert made.run_until(State.APPROACH)
-    tip = made.bench.clock.motion
+    tip = made.bench.motion
     made.loop.run_while(lambda: tip.reported.position_m[2] - RADIUS_M > 1e-3)
     told_m = tip.reported.position_m[2] - RADIUS_M
     assert made.controller.tell_touch()
@@ -422,13 +422,13 @@ def test_pressing_is_limited_from_the_touch_on_however_it_is_divided():
     bench, since_s = shaken.bench, {}
 
     def shake():
-        t_s = bench.clock.time_ns * 1e-9
+        t_s = bench.time_ns * 1e-9
         since_s.setdefault(shaken.controller.state, t_s)
         height_m = 5e-4 + 1e-4 * min(1.0, max(0.0, t_s - 0.5)) * np.sin(6 * np.pi * t_s)
         bench.plant.surface = PlantSurface.tilted(height_m, 0.0)
 
-    bench.clock.on_step.append(shake)
+    bench.on_step.append(shake)
     result = shaken.loop.make(shaken.goal)
     assert result.cause is Cause.TIME
     assert State.SETTLE in since_s
-    assert bench.clock.time_ns * 1e-9 - since_s[State.CONTACT] == pytest.approx(1.0, abs=0.01)
+    assert bench.time_ns * 1e-9 - since_s[State.CONTACT] == pytest.approx(1.0, abs=0.01)

@@ -194,11 +194,11 @@ def storm(rng, names):
     rig.rise_m, rig.top_m = 0.0, height_m + breath_m
 
     def breathe():
-        turn = 2 * np.pi * 0.3 * rig.bench.clock.time_ns * 1e-9 + phase
+        turn = 2 * np.pi * 0.3 * rig.bench.time_ns * 1e-9 + phase
         rise = rig.rise_m + breath_m / 2 * (1 + np.sin(turn))
         rig.bench.plant.surface = PlantSurface(plane.point_m + [0, 0, rise], plane.normal)
 
-    rig.bench.clock.on_step.insert(0, breathe)
+    rig.bench.on_step.insert(0, breathe)
     rig.loop.start(rig.goal)
     ends = []
     for name in names:

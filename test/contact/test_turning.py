@@ -138,12 +138,12 @@ class Travel:
         self.bench = ContactBench(SOFT, surface, start, tip=Tip(RADIUS_M))
         self.controller = ContactController(QUICK, limits, tip)
         rig = self.bench
-        self.loop = ContactLoop(rig.arm, rig.cell, rig.clock, self.controller)
+        self.loop = ContactLoop(rig.arm, rig.cell, rig, self.controller)
         self.poses, self.twists, self.force_n = [], [], []
-        rig.clock.on_step.append(self.record)
+        rig.on_step.append(self.record)
 
     def record(self):
-        motion = self.bench.clock.motion
+        motion = self.bench.motion
         self.poses.append(motion.pose)
         self.twists.append(motion.twist)
         self.force_n.append(self.bench.plant.normal_force_n)

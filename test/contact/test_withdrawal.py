@@ -47,7 +47,7 @@ def test_a_zero_that_creeps_holds_the_tip_too_and_the_reason_leaves_that_open():
     made = started()
     assert made.run_until(State.HOLD)
     faults = made.bench.cell.faults
-    made.bench.clock.on_step.append(lambda: setattr(faults, "bias_step_n", faults.bias_step_n + 1e-5))
+    made.bench.on_step.append(lambda: setattr(faults, "bias_step_n", faults.bias_step_n + 1e-5))
     made.run(1.0)
     made.controller.retract()
     made.run_until(State.IDLE, 4.0)
@@ -128,11 +128,11 @@ def test_surface_above_the_standoff_is_left_before_the_tip_is_idle(tare_drift_n_
     plane = made.bench.plant.surface
 
     def rise():
-        up_m = min(3e-3, (made.bench.clock.time_ns - began_ns) * 4e-12)  # 4 mm/s
+        up_m = min(3e-3, (made.bench.time_ns - began_ns) * 4e-12)  # 4 mm/s
         made.bench.plant.surface = PlantSurface(plane.point_m + [0, 0, up_m], plane.normal)
 
-    began_ns = made.bench.clock.time_ns
-    made.bench.clock.on_step.insert(0, rise)
+    began_ns = made.bench.time_ns
+    made.bench.on_step.insert(0, rise)
     assert made.run_until(State.IDLE, 6.0), made.controller.result
     assert made.controller.result.cause in (Cause.SURFACE_EARLY, Cause.TARE)
     # by position alone it would press with more than 100 mN at the standoff
@@ -203,15 +203,15 @@ def test_a_tip_that_was_held_far_up_comes_free_once_its_force_is_steady():
     def creep():
         faults.bias_step_n += creep_n[0]
 
-    made.bench.clock.on_step.append(creep)
+    made.bench.on_step.append(creep)
     assert made.run_until(State.FAULT, 8.0)
     assert "still changes" in made.controller.result.message
     creep_n[0] = 0.0
-    place_m = made.bench.clock.motion.reported.position_m[2]
+    place_m = made.bench.motion.reported.position_m[2]
     made.controller.retract()
     assert made.run_until(State.IDLE, 3.0), made.controller.result.message
     assert made.controller.result.retracted
-    assert 0 < made.bench.clock.motion.reported.position_m[2] - place_m < 5e-3
+    assert 0 < made.bench.motion.reported.position_m[2] - place_m < 5e-3
 
 
 def test_no_room_above_the_standoff_is_said_and_ends():

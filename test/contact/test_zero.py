@@ -96,12 +96,12 @@ def test_the_weight_on_a_cell_under_the_sample_does_not_turn_with_the_tip(turned
     start = Pose(touch.position_m + 2.5e-3 * normal, turn.as_rotvec())
     bench = ContactBench(SOFT, PlantSurface(np.zeros(3), normal), start, tip=Tip(RADIUS_M))
     controller = ContactController(QUICK, Limits(), under_sample=True)
-    loop = ContactLoop(bench.arm, bench.cell, bench.clock, controller)
+    loop = ContactLoop(bench.arm, bench.cell, bench, controller)
     loop.start(ContactGoal(touch, Aim(FORCE_N)))
     loop.run_while(lambda: controller.state not in (State.HOLD, State.FAULT), 20.0)
     assert controller.state is State.HOLD, controller.result
     true_n = []
-    bench.clock.on_step.append(lambda: true_n.append(normal @ bench.plant.force_n))
+    bench.on_step.append(lambda: true_n.append(normal @ bench.plant.force_n))
     loop.run_while(lambda: True, 0.3)
     result = controller.result
     assert abs(result.force_n - np.mean(true_n)) < 4 * result.force_std_n

@@ -11,7 +11,7 @@ from tactile_resonance.commands.mechanics import COLUMNS
 from tactile_resonance.mechanics.fit import fit_indentation
 from tactile_resonance.mechanics.indentation import Protocol
 from tactile_resonance.sensor import sensor_named
-from tactile_resonance.simulation.plant.tissue_bench import indent_tissue
+from tactile_resonance.simulation.plant.contact_bench import indent_tissue
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 

@@ -258,7 +258,7 @@ def test_normal_of_a_sphere_of_tissue_is_found_by_contacts(hollow):
     told = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], RADIUS_M)
     start = Pose(told.position_m + [0, 0, 3e-3], told.rotation_rad)
     bench = ContactBench(SOFT, surface, start, tip=Tip(RADIUS_M), seed=1)
-    loop = ContactLoop(bench.arm, bench.cell, bench.clock, ContactController(QUICK, Limits()))
+    loop = ContactLoop(bench.arm, bench.cell, bench, ContactController(QUICK, Limits()))
 
     def touch(point):
         pose = touch_pose(point.position_m, point.normal, [1, 0, 0], RADIUS_M)

@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """A whole contact bench in virtual time: plant, arm and load cell behind the contracts of the real drivers.
 
+`indent_tissue` carries out mechanical tests on it, with the controller of a contact.
+
 Time goes on only while somebody waits for it, so a run repeats to the last bit and takes as long as it takes to
 compute. Arm and cell have every fault of real ones.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.clock import Clock, Demand
+from tactile_resonance.contact.geometry import touch_pose
+from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
 from tactile_resonance.contact.interfaces import (
     ArmError,
     ArmFault,
@@ -22,14 +28,20 @@ from tactile_resonance.contact.interfaces import (
     ForceInfo,
     Mount,
 )
+from tactile_resonance.contact.loop import ContactLoop, IndentationRecorder
+from tactile_resonance.contact.machine import ContactController
+from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.contact.payload import Mounting, Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import nearer, six, vector
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
+from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
 from tactile_resonance.simulation.noise import Jitter, Seed
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
+from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
@@ -90,43 +102,6 @@ class TipMotion:
         self.pose = Pose(self.reported.position_m + self._jitter.step(), rotation)
 
 
-class VirtualBench(Clock):
-    """Robot, plant and time. It is the clock of the control loop.
-
-    Parameters
-    ----------
-    plant : Plant
-    motion : TipMotion
-        Of the robot, at its start.
-
-    Attributes
-    ----------
-    time_ns : int
-    on_step : list of callables
-        Called after every period: recorders, and faults at their time.
-    """
-
-    def __init__(self, plant: Plant, motion: TipMotion) -> None:
-        self.plant, self.motion = plant, motion
-        self.time_ns = 0
-        self.on_step: list[Callable[[], None]] = []
-        self._period_ns = round(1e9 * motion.period_s)
-        plant.step(transform_from_pose(motion.pose.vector), motion.period_s)
-
-    def now_ns(self) -> int:
-        """Virtual time since the start [ns]."""
-        return self.time_ns
-
-    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
-        """Let whole periods pass until a time is reached, whatever the demand."""
-        while self.time_ns < time_ns:
-            self.motion.step()
-            self.plant.step(transform_from_pose(self.motion.pose.vector), self.motion.period_s)
-            self.time_ns += self._period_ns
-            for action in self.on_step:
-                action()
-
-
 class VirtualArm:
     """An `Arm` on the bench, with the faults of a real one.
 
@@ -135,10 +110,10 @@ class VirtualArm:
 
     Parameters
     ----------
-    bench : VirtualBench
+    bench : ContactBench
     """
 
-    def __init__(self, bench: VirtualBench) -> None:
+    def __init__(self, bench: ContactBench) -> None:
         self._bench, self._motion = bench, bench.motion
         self._connected = False
         self._broken: ArmFault | None = None  # what connect and all commands meet
@@ -249,7 +224,7 @@ class VirtualCell(Transducer):
 
     Parameters
     ----------
-    bench : VirtualBench
+    bench : ContactBench
     mounting : Mounting
     parameters : CellParameters, optional
         By default those of ``config/load_cells/fine.yaml``.
@@ -265,7 +240,7 @@ class VirtualCell(Transducer):
 
     def __init__(
         self,
-        bench: VirtualBench,
+        bench: ContactBench,
         mounting: Mounting,
         parameters: CellParameters | None = None,
         seed: int = 0,
@@ -327,8 +302,8 @@ DISH_KG = 0.2
 """Of the sample with its dish on a cell under it (chosen)."""
 
 
-class ContactBench:
-    """The bench; connected and streaming.
+class ContactBench(Clock):
+    """Robot, plant and time; arm and cell are connected and streaming. It is the clock of the control loop.
 
     Parameters
     ----------
@@ -351,7 +326,11 @@ class ContactBench:
     Attributes
     ----------
     plant : Plant
-    clock : VirtualBench
+    motion : TipMotion
+        Of the robot.
+    time_ns : int
+    on_step : list of callables
+        Called after every period: recorders, and faults at their time.
     arm : VirtualArm
     cell : VirtualCell
     """
@@ -381,10 +360,108 @@ class ContactBench:
         )
         # of its own: of the cell's seed the arm would be shaken by the noise of the cell, one period earlier
         shaken = [seed, 1]
-        motion = TipMotion(tracking or TrackingParameters(), start, period_s=period_s, seed=shaken)
-        self.clock = VirtualBench(self.plant, motion)
-        self.arm = VirtualArm(self.clock)
+        self.motion = TipMotion(
+            tracking or TrackingParameters(), start, period_s=period_s, seed=shaken
+        )
+        self.time_ns = 0
+        self.on_step: list[Callable[[], None]] = []
+        self._period_ns = round(1e9 * period_s)
+        self.plant.step(transform_from_pose(start.vector), period_s)
+        self.arm = VirtualArm(self)
         seat = Mounting(mount, Pose.at_origin(), tool if on_tool else None)
-        self.cell = VirtualCell(self.clock, seat, cell_parameters, seed=seed)
+        self.cell = VirtualCell(self, seat, cell_parameters, seed=seed)
         self.arm.connect()
         self.cell.start()
+
+    def now_ns(self) -> int:
+        """Virtual time since the start [ns]."""
+        return self.time_ns
+
+    def wait_until(self, time_ns: int, demand: Demand = Demand.FAST, /) -> None:
+        """Let whole periods pass until a time is reached, whatever the demand."""
+        while self.time_ns < time_ns:
+            self.motion.step()
+            self.plant.step(transform_from_pose(self.motion.pose.vector), self.motion.period_s)
+            self.time_ns += self._period_ns
+            for action in self.on_step:
+                action()
+
+
+START_M = 5e-3
+"""Of the tip above the tissue."""
+LONGER_S = 60.0
+"""A test ends so long after its hold, or has failed."""
+
+
+def indent_tissue(
+    tissue: Tissue,
+    sensor: SensorParameters,
+    protocol: Protocol,
+    *,
+    hold_s: float,
+    force_n: float = 0.01,
+    unload_speed_m_s: float = 0.0,
+    rigid: bool = True,
+    seed: int = 0,
+    poisson_ratio: float = 0.49,
+    progress: Callable[[str], None] = lambda text: None,
+) -> IndentationRecord:
+    """Carry a test out as contact_node does, on tissue that was never touched and is known to be soft.
+
+    Parameters
+    ----------
+    tissue : Tissue
+    sensor : SensorParameters
+        For ball and beam.
+    protocol : Protocol
+    hold_s, force_n, unload_speed_m_s : float
+        As the action ``indent`` takes them; the limit of the hold is raised to what it needs.
+    rigid : bool
+        The ball on the robot itself; else at the end of the sensor's beam.
+    seed : int
+        Of arm and cell.
+    poisson_ratio : float
+    progress : callable
+        Told what is done.
+
+    Raises
+    ------
+    ValueError
+        If a limit of the contact refuses it.
+    RuntimeError
+        If the test failed, with its cause.
+    """
+    progress(
+        f"{protocol.value} of {tissue.label or tissue.name}, {hold_s:g} s at {1e3 * force_n:g} mN"
+    )
+    parameters, limits = read_contact()
+    modes = sensor_modes(sensor)
+    stiffness = math.inf if rigid else modes.static_stiffness_n_per_m
+    parameters = replace(
+        parameters,
+        beam_stiffness_n_per_m=0.0 if rigid else stiffness,
+        unknown_speed_m_s=parameters.approach_speed_m_s,  # it is no bone
+    )
+    limits = replace(limits, hold_s=max(limits.hold_s, hold_s + LONGER_S))
+    radius_m = sensor.tip.radius_m
+    touch = touch_pose([0, 0, 0], [0, 0, 1], [1, 0, 0], radius_m)
+    bench = ContactBench(
+        tissue,
+        PlantSurface.tilted(0.0, 0.0),
+        Pose(touch.position_m + [0, 0, START_M], touch.rotation_rad),
+        tip=Tip(radius_m, None if rigid else modes, poisson_ratio),
+        seed=seed,
+    )
+    hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
+    goal = ContactGoal(touch, Aim(force_n, hold), hold_s=hold_s, unload_speed_m_s=unload_speed_m_s)
+    ball = BallTip(radius_m, poisson_ratio, stiffness)
+    recorder = IndentationRecorder(goal, protocol, ball, bench.cell.info.name, simulated=True)
+    controller = ContactController(parameters, limits, under_sample=True)
+    loop = ContactLoop(bench.arm, bench.cell, bench, controller, recorder.take)
+    loop.start(goal)
+    ended = (State.IDLE, State.FAULT)
+    loop.run_while(lambda: controller.state not in ended, hold_s + LONGER_S)
+    result = controller.result
+    if result is None or not result.reached or controller.state is not State.IDLE:
+        raise RuntimeError(f"test of {tissue.name}: {controller.state.value}: {result}")
+    return replace(recorder.record(result), label=tissue.label or tissue.name)
