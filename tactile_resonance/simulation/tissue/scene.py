@@ -65,7 +65,7 @@ class Box:
 
     def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie inside or on the faces."""
-        position = _coordinates(position_m, len(self.low_m))
+        position = position_m[..., : len(self.low_m)]
         inside = (position >= np.asarray(self.low_m)) & (position <= np.asarray(self.high_m))
         return np.asarray(inside.all(axis=-1))
 
@@ -84,33 +84,32 @@ class HalfSpace:
 
     def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie on the side the normal points away from."""
-        position = _coordinates(position_m, len(self.normal))
+        position = position_m[..., : len(self.normal)]
         return np.asarray((position - np.asarray(self.point_m)) @ np.asarray(self.normal) <= 0)
 
 
 @dataclass(frozen=True)
 class Sphere(Checked):
-    """A ball; positions without a height are taken at height 0."""
+    """A ball."""
 
     center_m: Vector
     radius_m: AboveZero
 
     def contains(self, position_m: FloatArray) -> BoolArray:
         """Tell which positions lie inside or on the surface."""
-        position = _coordinates(position_m, 3)
-        x, y, z = np.moveaxis(position - np.asarray(self.center_m), -1, 0)
+        x, y, z = np.moveaxis(position_m - np.asarray(self.center_m), -1, 0)
         return np.asarray(x * x + y * y + z * z <= self.radius_m**2)
 
 
 Shape = Disc | Box | HalfSpace | Sphere
 
 
-def _coordinates(position_m: FloatArray, count: int) -> FloatArray:
-    """Cut off the height, or add height 0, so that the last axis has `count` coordinates."""
-    missing = count - position_m.shape[-1]
-    if missing <= 0:
-        return position_m[..., :count]
-    return np.concatenate([position_m, np.zeros((*position_m.shape[:-1], missing))], axis=-1)
+def _in_space(position_m: ArrayLike) -> FloatArray:
+    """Positions (..., 2 or 3) as (..., 3); those without a height are at height 0."""
+    position = np.asarray(position_m, dtype=float)
+    good = position.ndim >= 1 and position.shape[-1] in (2, 3)
+    require(good, "position_m", position.shape, "shape (..., 2) or (..., 3)")
+    return np.pad(position, [(0, 0)] * (position.ndim - 1) + [(0, 3 - position.shape[-1])])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,9 +298,7 @@ class PhantomScene:
 
     def region_index(self, position_m: ArrayLike) -> IntArray:
         """Return the index of the region at positions (..., 2 or 3) [m], -1 where there is none."""
-        position = np.asarray(position_m, dtype=float)
-        good = position.ndim >= 1 and position.shape[-1] in (2, 3)
-        require(good, "position_m", position.shape, "shape (..., 2) or (..., 3)")
+        position = _in_space(position_m)
         index = np.full(position.shape[:-1], -1, dtype=np.int64)
         for i, region in enumerate(self.regions):
             index = np.where(region.shape.contains(position), i, index)
@@ -316,9 +313,7 @@ class PhantomScene:
         index = int(self.region_index(position_m))
         if index < 0:
             return None
-        position = np.zeros(3)
-        given = np.asarray(position_m, dtype=float)
-        position[: given.size] = given
+        position = _in_space(position_m)
         tissue = self.regions[index].material(position)
         position[2] = 0.0
         # Hertz contact of the preload, as in `hertz_contact`

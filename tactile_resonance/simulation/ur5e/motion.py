@@ -134,8 +134,7 @@ def movel(target: Target, goal: Transform, acceleration: float, speed: float) ->
     _require_positive("movel", "speed", speed)
     yield from stopl(target, acceleration)
     start = target.tool
-    (x, y, z), (from_x, from_y, from_z) = goal[1], start[1]
-    shift = (x - from_x, y - from_y, z - from_z)
+    shift = difference(goal[1], start[1])
     turn = turn_between(start, goal)
     length = max(math.hypot(*shift), math.hypot(*turn))
     if length == 0.0:

@@ -10,6 +10,7 @@ from tactile_resonance.contact.vectors import (
     NO_TURN,
     Turn,
     Vector,
+    added,
     dot,
     rotated_back,
     transposed,
@@ -74,9 +75,9 @@ def inverse_transform(transform: Transform) -> Transform:
 
 def turned(transform: Transform, shift_m: Vector, turn_rad: Vector) -> Transform:
     """Return a transform shifted and then turned about its own origin, both in the base."""
-    turn, (x, y, z) = transform
-    place = (x + shift_m[0], y + shift_m[1], z + shift_m[2])
-    return (turn_product(turn_from_vector(turn_rad), turn) if any(turn_rad) else turn), place
+    turn, place = transform
+    turn = turn_product(turn_from_vector(turn_rad), turn) if any(turn_rad) else turn
+    return turn, added(place, shift_m)
 
 
 def turn_between(start: Transform, end: Transform) -> Vector:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -61,11 +60,12 @@ class Layout:
 
     Parameters
     ----------
-    types : sequence of str
-        RTDE types.
+    names, types : sequences of str
+        Of the variables; RTDE types.
     """
 
-    def __init__(self, types: Sequence[str]) -> None:
+    def __init__(self, names: Sequence[str], types: Sequence[str]) -> None:
+        self.names = tuple(names)
         self._lengths = [_LAYOUT[name][1] for name in types]
         codes = "".join(f"{_LAYOUT[name][1]}{_LAYOUT[name][0]}" for name in types)
         self._struct = struct.Struct(">B" + codes)
@@ -102,13 +102,6 @@ class Layout:
 
 PORT = 30004
 CYCLE_HZ = 500.0
-
-
-@dataclass(frozen=True)
-class _Recipe:
-    names: tuple[str, ...]
-    layout: Layout
-    readers: tuple[Reader, ...] = ()  # of outputs
 
 
 class RtdeServer:
@@ -182,8 +175,9 @@ class _Client:
         self.connection = connection
         self.inputs: set[str] = set()
         self._server = server
-        self._recipes: dict[int, _Recipe] = {}
-        self._outputs: _Recipe | None = None
+        self._recipes: dict[int, Layout] = {}
+        self._outputs: Layout | None = None
+        self._readers: list[Reader] = []  # of the outputs
         self._period = 1
         self._started = False
         self._newest = b""  # outputs that were sent last
@@ -223,8 +217,8 @@ class _Client:
         assert recipe is not None
         data = known.get(recipe.names)
         if data is None:
-            values = [read(controller) for read in recipe.readers]
-            data = known[recipe.names] = recipe.layout.pack(1, values)
+            values = [read(controller) for read in self._readers]
+            data = known[recipe.names] = recipe.pack(1, values)
         self._newest = data
         if self.connection.send(data, droppable=True):
             self.sent_ns = round((controller.time_s + controller.stood_still_s) * 1e9)
@@ -247,7 +241,7 @@ class _Client:
         types = [OUTPUTS[name][0] if name in OUTPUTS else "NOT_FOUND" for name in names]
         if "NOT_FOUND" in types:
             return b"\x00" + ",".join(types).encode()
-        self._outputs = _Recipe(names, Layout(types), tuple(OUTPUTS[name][1] for name in names))
+        self._outputs, self._readers = Layout(names, types), [OUTPUTS[name][1] for name in names]
         self._newest = b""
         return b"\x01" + ",".join(types).encode()
 
@@ -260,7 +254,7 @@ class _Client:
         if "IN_USE" in types or "NOT_FOUND" in types:
             return b"\x00" + ",".join(types).encode()
         recipe = len(self._recipes) + 1
-        self._recipes[recipe] = _Recipe(names, Layout(types))
+        self._recipes[recipe] = Layout(names, types)
         self.inputs.update(names)
         return bytes([recipe]) + ",".join(types).encode()
 
@@ -269,7 +263,7 @@ class _Client:
         if recipe is None:
             return
         self._server.packets += 1
-        values = recipe.layout.unpack(payload)
+        values = recipe.unpack(payload)
         if values is None:  # a real controller takes no packet of the wrong size either
             return
         self._server.controller.write_inputs(dict(zip(recipe.names, values, strict=True)))

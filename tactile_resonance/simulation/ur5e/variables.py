@@ -60,7 +60,7 @@ class Registers:
         Written by the program.
     refreshed : set of str
         Names of inputs written since the last cycle, with whatever value: what a watchdog watches.
-    digital_inputs, digital_outputs : int
+    digital_outputs : int
         Bits 0-7 standard, 8-15 configurable, 16-17 tool.
     analog_outputs : list of 2 floats
         As written, 0 to 1 of the range.
@@ -74,7 +74,6 @@ class Registers:
         self.output_int = [0] * _REGISTER_COUNT
         self.output_double = [0.0] * _REGISTER_COUNT
         self.refreshed: set[str] = set()
-        self.digital_inputs = 0
         self.digital_outputs = 0
         self.analog_outputs = [0.0, 0.0]
         self.speed_slider = 1.0
@@ -158,7 +157,7 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "actual_TCP_force": ("VECTOR6D", lambda robot: robot.machine.tcp_force),
     "target_TCP_pose": ("VECTOR6D", lambda robot: robot.machine.target.pose),
     "target_TCP_speed": ("VECTOR6D", lambda robot: robot.machine.target.twist),
-    "actual_digital_input_bits": ("UINT64", lambda robot: robot.registers.digital_inputs),
+    "actual_digital_input_bits": ("UINT64", lambda robot: 0),
     "actual_digital_output_bits": ("UINT64", lambda robot: robot.registers.digital_outputs),
     "joint_temperatures": ("VECTOR6D", lambda robot: [NOMINAL_TEMPERATURE_C] * 6),
     "robot_mode": ("INT32", lambda robot: int(robot.robot_mode)),

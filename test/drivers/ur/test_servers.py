@@ -30,7 +30,7 @@ VALUES = {
     st.lists(st.sampled_from(sorted(VALUES)).flatmap(lambda t: st.tuples(st.just(t), VALUES[t])))
 )
 def test_data_packets_carry_what_was_packed(fields):
-    layout = Layout([kind for kind, _ in fields])
+    layout = Layout([f"v{k}" for k in range(len(fields))], [kind for kind, _ in fields])
     data = layout.pack(7, [value for _, value in fields])
     payload = data[HEADER.size :]
     assert HEADER.unpack_from(data) == (len(data), Kind.DATA)
