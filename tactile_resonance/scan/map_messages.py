@@ -60,7 +60,25 @@ def cloud_message(pole_map: PoleMap, names: tuple[str, ...], header: Message) ->
         status = _STATUS.get(found.poles_status, NO_STATUS)
         of_contact = found.force_n, found.tissue_probability
         rows.append((*point.position_m, *figures, *of_contact, called, status, b""))
-    return _cloud(np.array(rows, POINT), header)
+    field: Any = message_types().types[_FIELD]
+    types = {"<f4": field.FLOAT32, "|u1": field.UINT8}
+    fields = [
+        field(name=name, offset=offset, datatype=types[kind.str], count=1)
+        for name, (kind, offset, *_) in (POINT.fields or {}).items()
+        if kind.str in types
+    ]
+    table = np.array(rows, POINT)
+    return make_message(
+        CLOUD,
+        header=header,
+        height=1,
+        width=len(table),
+        fields=fields,
+        point_step=POINT.itemsize,
+        row_step=table.nbytes,
+        data=table.view(np.uint8).ravel(),
+        is_dense=True,
+    )
 
 
 def surface_message(pole_map: PoleMap, cells: int, header: Message) -> Message:
@@ -207,27 +225,6 @@ def restamp(message: Message, time_ns: int) -> None:
     """Set all stamps of a message."""
     for part in getattr(message, "markers", [message]):
         write_header(part.header, time_ns, part.header.frame_id)
-
-
-def _cloud(table: np.ndarray, header: Message) -> Message:
-    field: Any = message_types().types[_FIELD]
-    types = {"<f4": field.FLOAT32, "|u1": field.UINT8}
-    fields = [
-        field(name=name, offset=offset, datatype=types[kind.str], count=1)
-        for name, (kind, offset, *_) in (table.dtype.fields or {}).items()
-        if kind.str in types
-    ]
-    return make_message(
-        CLOUD,
-        header=header,
-        height=1,
-        width=len(table),
-        fields=fields,
-        point_step=table.dtype.itemsize,
-        row_step=table.nbytes,
-        data=table.view(np.uint8).ravel(),
-        is_dense=True,
-    )
 
 
 def _marker(header: Message, namespace: str, number: int, kind: str) -> Message:
