@@ -19,8 +19,7 @@ from tqdm import tqdm
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.mechanics.course import course_of
 from tactile_resonance.mechanics.fit import Fit, Known, fit_indentation
-from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
-from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Prony, Protocol
 from tactile_resonance.report.drawing import draw_tests, save_figure
 from tactile_resonance.scan.tissue_tests import TissueTest, fitted
 from tactile_resonance.sensor import sensor_named

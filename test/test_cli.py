@@ -137,7 +137,7 @@ from numba.core import event
 
 from tactile_resonance.mechanics import course
 from tactile_resonance.mechanics.fit import fit_indentation
-from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.indentation import Prony
 
 sys.path.insert(0, sys.argv[1])
 from benchmarks.mechanics import relaxation

@@ -31,8 +31,7 @@ from tactile_resonance.mechanics.course import (
     layer_share,
     sphere_share,
 )
-from tactile_resonance.mechanics.indentation import IndentationRecord, means_of
-from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.indentation import IndentationRecord, Prony, means_of
 
 MOST_TERMS = 4
 SHOWN, SURE = 2.5, 2.0

@@ -6,8 +6,7 @@ from scipy.optimize import brentq
 
 from benchmarks.mechanics import RADIUS_M, force_over
 from tactile_resonance.mechanics.course import layer_share, sphere_share
-from tactile_resonance.mechanics.indentation import BallTip
-from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.indentation import BallTip, Prony
 from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import read_tissues

@@ -7,8 +7,13 @@ from scipy.stats import binom
 
 from benchmarks.mechanics import RADIUS_M, errors_of, force_over, relaxation
 from tactile_resonance.mechanics.fit import Known, fit_indentation
-from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol, means_of
-from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.indentation import (
+    BallTip,
+    IndentationRecord,
+    Prony,
+    Protocol,
+    means_of,
+)
 from tactile_resonance.simulation.tissue.library import read_tissues
 
 STANDARD = Prony(4e3, np.array([3e3]), np.array([2.0]))

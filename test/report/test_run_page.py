@@ -20,8 +20,7 @@ from tactile_resonance.cli import main
 from tactile_resonance.frf.estimate import frf_of_record
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.frf.spectra import Spectrum
-from tactile_resonance.mechanics.indentation import Protocol
-from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.indentation import Prony, Protocol
 from tactile_resonance.report import point_details
 from tactile_resonance.report.page import as_json, frf_entry, model_response, s_plane
 from tactile_resonance.report.paper_figures import paper_figures

@@ -14,8 +14,7 @@ import yaml
 from benchmarks.mechanics import relaxation
 from tactile_resonance.cli import main
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.mechanics.indentation import Protocol
-from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.indentation import Prony, Protocol
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal
 from tactile_resonance.scan.hands import ATTEMPTS, PointDisturbed, PointFailed
 from tactile_resonance.scan.plan import make_plan, plan_rows

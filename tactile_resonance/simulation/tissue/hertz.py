@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from tactile_resonance._typing import ComplexArray
 from tactile_resonance.calibration.model import ContactStiffness
 from tactile_resonance.fields import AboveZero, Checked, Range, require
-from tactile_resonance.mechanics.prony import Prony
+from tactile_resonance.mechanics.indentation import Prony
 
 
 @dataclass(frozen=True)
