@@ -32,7 +32,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
 _TAKEN: dict[int, socket.socket] = {}  # ROS domains that this process took, until it ends
 
 
-class NodeProcesses:
+class NodeProcesses(contextlib.AbstractContextManager["NodeProcesses"]):
     """Nodes of this package as processes; a context that ends them all.
 
     Parameters
@@ -47,9 +47,6 @@ class NodeProcesses:
         self._log_folder = log_folder
         self._prefix = tuple(prefix)
         self._processes: dict[str, subprocess.Popen] = {}
-
-    def __enter__(self) -> NodeProcesses:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
@@ -88,7 +85,7 @@ class NodeProcesses:
         """End nodes as a crash would, with SIGKILL, all before the first is waited for."""
         killed = [self._processes.pop(node) for node in nodes]
         for process in killed:
-            _signal(process, signal.SIGKILL)
+            process.kill()
         for process in killed:
             process.wait()
 
@@ -110,7 +107,7 @@ class NodeProcesses:
         Child processes of a killed node end soon after it; they are waited for, too.
         """
         for process in self._processes.values():
-            _signal(process, signal.SIGINT)
+            process.send_signal(signal.SIGINT)
         deadline = time.monotonic() + END_WITHIN_S + GRACE_S
         orphans: list[Path] = []
         for process in self._processes.values():
@@ -119,7 +116,7 @@ class NodeProcesses:
                 process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 orphans += _children(process.pid)
-                _signal(process, signal.SIGKILL)
+                process.kill()
                 process.wait()
         self._processes.clear()
         deadline = time.monotonic() + GRACE_S
@@ -310,8 +307,3 @@ def _runs(process: Path) -> bool:
         return (process / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def _signal(process: subprocess.Popen, number: int) -> None:
-    if process.poll() is None:
-        process.send_signal(number)

@@ -7,6 +7,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ def require_packages(*packages: str) -> None:
             )
 
 
-class ProgressBar:
+class ProgressBar(AbstractContextManager["ProgressBar"]):
     """How far work is: a bar on a terminal, lines elsewhere.
 
     Parameters
@@ -123,9 +124,6 @@ class ProgressBar:
 
         self._bar = tqdm(unit="point", file=sys.stderr, leave=False, disable=None, **options)
         self._said: object = None
-
-    def __enter__(self) -> ProgressBar:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()

@@ -32,7 +32,7 @@ from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.parameters import Fixed, Parameter, file_of, values
 from tactile_resonance.nodes.topic_wrench import TopicWrench
 from tactile_resonance.nodes.twist_arm import TwistArm
-from tactile_resonance.processes import may_take_priority, take_priority
+from tactile_resonance.processes import take_priority
 from tactile_resonance.sensor import read_sensor
 
 _GROUPS = {"contact": ContactParameters, "limits": Limits}
@@ -123,17 +123,17 @@ def take_realtime(node: ManagedNode) -> int:
     In simulated time nothing is late, and none is taken.
     """
     (priority,) = values(node, "realtime_priority")
-    if node.time_server:
+    if node.time_server or not priority:
         return 0
-    if priority and may_take_priority(priority):
+    try:
         take_priority(priority)
-        return priority
-    if priority:
+    except ValueError:
         node.get_logger().warning(
             f"realtime_priority: {priority} is not permitted here (rtprio limit); on a busy machine the "
             "control loop will be late, and stop"
         )
-    return 0
+        return 0
+    return priority
 
 
 def make_arm(node: ManagedNode, priority: int) -> NodeArm:
