@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -389,25 +388,19 @@ class TactileClient:
         """From the goal to the outcome, one step with each tick."""
         waited_for = "no scan_node is there"
         deadline_s = time.monotonic() + asked.wait_s
-        while not asked.cancelled and time.monotonic() < deadline_s:
+
+        def wanted() -> bool:
+            return not asked.cancelled and time.monotonic() < deadline_s
+
+        while wanted():
             if not asked.client.server_is_ready():
                 yield
                 continue
-            # what was asked for may have begun: its answer is waited for even where it is wanted no more
-            wanted_s = time.monotonic()
-            with contextlib.closing(offer(asked.client, asked.goal, asked.hear)) as steps:
-                while time.monotonic() - wanted_s < ASK_AGAIN_S:
-                    try:
-                        next(steps)
-                    except StopIteration as answered:
-                        asked.handle = answered.value
-                        break
-                    yield
-                    if not asked.cancelled and time.monotonic() < deadline_s:
-                        wanted_s = time.monotonic()
-                else:
-                    waited_for = "scan_node does not answer"
-                    break
+            try:
+                asked.handle = yield from offer(asked.client, asked.goal, asked.hear, wanted)
+            except TimeoutError:
+                waited_for = "scan_node does not answer"
+                break
             if asked.handle is not None:
                 answer = yield from answer_to(asked.client, asked.handle, lambda: asked.heard_s)
                 return asked.lost() if answer is None else asked.outcome(answer)

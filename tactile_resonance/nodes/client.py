@@ -20,7 +20,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from tactile_resonance import msg
 from tactile_resonance.client import CalibrationOutcome, ScanOutcome, TactileClient
-from tactile_resonance.nodes.goals import Goals, answer_of
+from tactile_resonance.nodes.goals import Goals, answer_of, wait_for
 from tactile_resonance.nodes.running import NEWEST, POINT_RESULTS, RESULTS, SERIES
 from tactile_resonance.recording.messages import poles_from_message, time_from_message
 from tactile_resonance.scan.hands import NodeAway, ScanEnded
@@ -89,12 +89,8 @@ class NodeClient(ABC):
 
     def wait(self, done: Callable[[], bool], timeout_s: float, what: str) -> None:
         """Spin until something holds; `NoAnswer` where it does not in time."""
-        deadline = time.monotonic() + timeout_s
-        while not done():
-            self._check()
-            if time.monotonic() > deadline:
-                raise self._no_answer(timeout_s, what)
-            self.spin(0.05)
+        if not wait_for(done, timeout_s, self._check, lambda _: self.spin(0.05)):
+            raise self._no_answer(timeout_s, what)
 
     def answer(self, service: Client, request: Any, timeout_s: float = HANGS_S) -> Any:
         """Answer of a service, which is waited for."""

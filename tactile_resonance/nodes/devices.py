@@ -24,7 +24,7 @@ from tactile_resonance.drivers.acquisition import AcquisitionDevice, DeviceError
 from tactile_resonance.drivers.nidaq import NiDaqConfig, NiDaqDevice
 from tactile_resonance.fields import read_file
 from tactile_resonance.multisine import Excitation
-from tactile_resonance.nodes.goals import answer_of
+from tactile_resonance.nodes.goals import answer_of, wait_for
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import excitation_to_message, time_message
 from tactile_resonance.nodes.parameters import Fixed, values
@@ -84,7 +84,6 @@ FORCE_WITHIN_S = 0.25
 """Longest time for which a record waits for its force, on the machine's clock; not in simulated time [s]."""
 DISCOVERED_WITHIN_S = 10.0
 """In simulated time a node that has just come up, and is not known to all yet, is waited for so long [s]."""
-POLL_S = 5e-4
 
 
 def make_device(node: ManagedNode) -> tuple[AcquisitionDevice, Sequence[bytes]]:
@@ -294,12 +293,10 @@ class MeasuredContact:
 
         What it gives waits for the answer: a contact, with a reason where the force is unknown.
         """
-        deadline = time.monotonic() + min(self._within_s, DISCOVERED_WITHIN_S)
         # rclpy's own wait looks four times a second
-        while not self._client.service_is_ready():
-            if time.monotonic() >= deadline:
-                return partial(Contact, reason=f"no node serves {self._client.srv_name}")
-            time.sleep(POLL_S)
+        within_s = min(self._within_s, DISCOVERED_WITHIN_S)
+        if not wait_for(self._client.service_is_ready, within_s):
+            return partial(Contact, reason=f"no node serves {self._client.srv_name}")
         request = ForceOver.Request(start=time_message(start_ns), end=time_message(end_ns))
         answered = threading.Event()
         future = self._client.call_async(request)

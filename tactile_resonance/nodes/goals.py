@@ -146,9 +146,9 @@ class Goals:
                 raise NodeAway(f"{self.name}: its node does not know the goal", "node went away")
         except (PointFailed, Interrupted, ScanEnded):
             # a node that was restarted, or is gone, does not know the goal: its end is not waited for
-            cancelled = _done(handle.cancel_goal_async())
-            answer = self._wait(cancelled, lambda: None, time.monotonic() + ASK_AGAIN_S)
-            if answer is not None and answer.goals_canceling:
+            cancelled = handle.cancel_goal_async()
+            answered = wait_for(cancelled.done, ASK_AGAIN_S, pause=self.pause)
+            if answered and cancelled.result().goals_canceling:
                 self._wait(steps, lambda: None, time.monotonic() + GOAL_ENDS_WITHIN_S)
             raise
         if failed_in(answer):
@@ -171,6 +171,22 @@ class Goals:
         if not self.client.server_is_ready():
             raise NodeAway(f"{self.name}: its node went away", "node went away")
         check()
+
+
+def wait_for(
+    holds: Callable[[], bool],
+    within_s: float,
+    check: Check = lambda: None,
+    pause: Callable[[float], None] = time.sleep,
+) -> bool:
+    """Whether something holds within a time [s]; `check` and `pause` as those of `answer_of`."""
+    deadline_s = time.monotonic() + within_s
+    while not holds():
+        check()
+        if time.monotonic() > deadline_s:
+            return False
+        pause(POLL_S)
+    return True
 
 
 def answer_of(
@@ -213,16 +229,26 @@ def answer_of(
     return None if answer is None else answer.result()
 
 
-def offer(client: ActionClient, goal: Any, feedback: Callable[[Any], None]) -> Steps:
+def offer(
+    client: ActionClient,
+    goal: Any,
+    feedback: Callable[[Any], None],
+    wanted: Callable[[], bool] = lambda: True,
+) -> Steps:
     """Offer a goal until it is answered; the handle of one that was accepted, None of one that was refused.
 
-    One that is closed before is given up: whatever accepts the goal later cancels it.
+    One that is closed before is given up: whatever accepts the goal later cancels it. So is, with
+    ``TimeoutError``, one that has no answer for a while after it was `wanted` last: it may have begun.
     """
     goal_id = UUID(uuid=list(uuid.uuid4().bytes))
     futures: list[Future] = []
-    asked_s = -math.inf
+    asked_s, wanted_s = -math.inf, time.monotonic()
     try:
         while True:
+            if wanted():
+                wanted_s = time.monotonic()
+            elif time.monotonic() - wanted_s > ASK_AGAIN_S:
+                raise TimeoutError
             if time.monotonic() - asked_s > ASK_AGAIN_S and client.server_is_ready():
                 futures.append(client.send_goal_async(goal, feedback, goal_uuid=goal_id))
                 asked_s = time.monotonic()
@@ -285,13 +311,6 @@ def _known(refused: ClientGoalHandle) -> Generator[None, None, bool]:
             return True  # it is under way
         yield
     return result.result().status != GoalStatus.STATUS_UNKNOWN
-
-
-def _done(future: Future) -> Steps:
-    """Result of a future."""
-    while not future.done():
-        yield
-    return future.result()
 
 
 def _drop(futures: list[Future]) -> None:

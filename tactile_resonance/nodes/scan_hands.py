@@ -20,7 +20,7 @@ from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.nodes.goals import POLL_S, answer_of
+from tactile_resonance.nodes.goals import answer_of, wait_for
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.measure_client import MeasureClient
 from tactile_resonance.nodes.messages import pose_to_message
@@ -127,9 +127,7 @@ class NodeHands:
         """Conduct the time; begins once the nodes have discovered the subscriptions of this scan."""
         within_s = MET_SIMULATED_WITHIN_S if self._time.simulated else MET_WITHIN_S
         with self._time.conducted():
-            deadline = time.monotonic() + within_s
-            while not self._nodes.met() and time.monotonic() < deadline:
-                time.sleep(POLL_S)
+            wait_for(self._nodes.met, within_s)
             yield
 
     def now_s(self) -> float:
@@ -174,16 +172,15 @@ class NodeHands:
 
         A touch that is disturbed is repeated, once the tip is not stopped.
         """
-        if self._tip is None:
+        tip = self._tip
+        if tip is None:
             raise ScanEnded(NOT_MOVED)
         pose, disturbed, result = self._pose_of(point), Disturbances(), None
         while result is None:
-            while self._tip.stopped:
-                check()
-                time.sleep(POLL_S)
+            wait_for(lambda: not tip.stopped, math.inf, check)
             try:
                 # anew each time: a node that was restarted is another one
-                result = self._tip.touch(pose, force_n, self._check_of([STATE_TOPIC], check))
+                result = tip.touch(pose, force_n, self._check_of([STATE_TOPIC], check))
             except PointDisturbed as error:
                 if not disturbed.again(error):
                     raise
@@ -336,9 +333,7 @@ class NodeHands:
 
     def _place(self, pose: PoseStamped, check: Check) -> None:
         """Publish where the tip is, once another node listens, and wait until it is received there."""
-        deadline = time.monotonic() + DISCOVERED_WITHIN_S
-        while self._pose.get_subscription_count() <= RECORDERS and time.monotonic() < deadline:
-            check()
-            time.sleep(POLL_S)
+        heard = self._pose.get_subscription_count
+        wait_for(lambda: heard() > RECORDERS, DISCOVERED_WITHIN_S, check)
         self._pose.publish(pose)
         self._pose.wait_for_all_acked(Duration(seconds=self._time.patience_s(PLACED_WITHIN_S)))

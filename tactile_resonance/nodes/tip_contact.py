@@ -15,7 +15,7 @@ from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.contact.result import Cause
-from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, answer_of
+from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, answer_of, wait_for
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import HOLDS
 from tactile_resonance.nodes.node_watch import ScanTime
@@ -172,7 +172,7 @@ class TipContact:
             self._end_if_hung()
             self._time.go()
             why = self._ask_to_retract()
-            if not why and self._seen_within(msg.ContactState.STATE_IDLE, ASK_AGAIN_S):
+            if not why and wait_for(lambda: self._is(msg.ContactState.STATE_IDLE), ASK_AGAIN_S):
                 self.touching, self.touched_ns = False, None
                 moved_n = self._state.zero_moved_n
                 # a refused goal made no contact: the state still describes the one before
@@ -190,8 +190,8 @@ class TipContact:
         self._low = False
         self._time.go()
         asked = not self._ask_to_retract()
-        if asked and self._seen_within(msg.ContactState.STATE_RETRACT, ASK_AGAIN_S):
-            self._seen_within(msg.ContactState.STATE_IDLE, TOUCH_RETRACT_WITHIN_S)
+        if asked and wait_for(lambda: self._is(msg.ContactState.STATE_RETRACT), ASK_AGAIN_S):
+            wait_for(lambda: self._is(msg.ContactState.STATE_IDLE), TOUCH_RETRACT_WITHIN_S)
 
     def check(self) -> None:
         """`PointFailed` or `PointDisturbed` where a contact that was made is held no longer.
@@ -248,14 +248,9 @@ class TipContact:
         time.sleep(0.05)
         return str(answer.message)
 
-    def _seen_within(self, wanted: str, seconds: float) -> bool:
-        """Whether contact_node reports a state within a time; idle: that the tip is free."""
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
-            if self._state.state == wanted:
-                return True
-            time.sleep(POLL_S)
-        return False
+    def _is(self, state: str) -> bool:
+        """Whether contact_node reports a state; idle: that the tip is free."""
+        return bool(self._state.state == state)
 
     def _on_state(self, message: msg.ContactState) -> None:
         before, stamp_ns = self._state, time_from_message(message.header.stamp)
