@@ -104,6 +104,8 @@ _FALSE_ALARM = 1e-4
 _WINDOW = 33
 DOF_OF_A_BIN = 1 / 4.2
 """Of a median of powers: 2.1 for the median, 2.0 bins that the window makes alike."""
+NOISE_BINS = 2.004353
+"""Bins whose noise the window takes together."""
 MAIN_LOBE = 4
 """Bins on either side that the window spreads a tone over; its side lobes are 92 dB down."""
 FIRST_BIN = 16
@@ -176,7 +178,7 @@ def silent_record(
     tone is a peak above the median of the bins around, beyond what noise makes. Its frequency and size
     are those of a parabola through the logarithms of its three largest bins.
     """
-    from scipy.signal.windows import blackmanharris  # half a second, which nodes need not wait for
+    from scipy.signal import welch  # half a second, which nodes need not wait for
 
     tones: list[Tone] = []
     noise = []
@@ -184,28 +186,27 @@ def silent_record(
     for x, channel in ((u, "actuator"), (y, "sensor")):
         if not np.all(np.isfinite(x)):
             raise ValueError(f"{channel}: holds samples that are not finite, expected volts")
-        pieces = _pieces(np.asarray(x, float))
-        samples = pieces.shape[1]
-        window = blackmanharris(samples, sym=False)
-        spectrum = scipy.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window)
-        power = np.mean(np.abs(spectrum) ** 2, axis=0)  # (K,)
+        records = np.asarray(x, float).reshape(-1, int(np.prod(np.shape(x)[-2:])))
+        pieces = -(-records.shape[1] // MOST_SAMPLES)
+        samples = records.shape[1] // pieces
         resolution_hz = sample_rate_hz / samples
+        _, each = welch(records, sample_rate_hz, "blackmanharris", samples, 0, scaling="spectrum")
+        power = each.mean(axis=0)  # (K,) mean squares of tones
         kind = np.zeros(power.size, bool)
         first = max(int(np.ceil(edges[0] / resolution_hz)), FIRST_BIN)
         kind[first : int(edges[1] / resolution_hz) + 1] = True
-        level, around = level_around(power, kind, len(pieces), _WINDOW)
+        count = pieces * len(records)
+        level, around = level_around(power, kind, count, _WINDOW)
         if not around:
             raise ValueError(
                 f"band_hz: {edges[0]:g}..{edges[1]:g} Hz hold {kind.sum()} bins above the "
                 f"{FIRST_BIN * resolution_hz:g} Hz from which a record of this length shows tones, "
                 "expected 8 or more"
             )
-        density = np.median(level[kind]) * 2 / (sample_rate_hz * np.sum(window**2))
-        noise.append(float(np.sqrt(density)))
-        least = EXACT * np.mean(pieces**2) * np.sum(window) ** 2
-        for at, size in _peaks(power, kind & (power > least), level, len(pieces), around):
-            rms_v = np.sqrt(2 * size) / np.sum(window)
-            tones.append(Tone(float(at * resolution_hz), float(rms_v), channel, resolution_hz))
+        noise.append(float(np.sqrt(np.median(level[kind]) / (NOISE_BINS * resolution_hz))))
+        used = kind & (power > EXACT * np.mean(records**2))
+        for at, size in _peaks(power, used, level, count, around):
+            tones.append(Tone(float(at * resolution_hz), float(np.sqrt(size)), channel, resolution_hz))
     tones.sort(key=lambda tone: -tone.rms_v)
     seen_hz = float(max(edges[0], FIRST_BIN * resolution_hz)), float(edges[1])  # alike of both channels
     return SilentRecord(tuple(tones), noise[0], noise[1], seen_hz)
@@ -255,14 +256,6 @@ def check_undriven(
             f"record: the actuator has {above_db:.0f} dB more power at the excited lines than between them, "
             "expected a record taken without drive; without --silent its response is estimated"
         )
-
-
-def _pieces(x: FloatArray) -> FloatArray:
-    """(pieces, samples) of records (..., P, N)."""
-    records = x.reshape(-1, int(np.prod(x.shape[-2:])))
-    count = -(-records.shape[1] // MOST_SAMPLES)
-    samples = records.shape[1] // count
-    return records[:, : count * samples].reshape(-1, samples)
 
 
 def _peaks(
