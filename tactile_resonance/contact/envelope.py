@@ -13,8 +13,8 @@ from bisect import bisect
 from collections import deque
 from typing import NamedTuple
 
+from tactile_resonance.contact.goal import Breach, Cause
 from tactile_resonance.contact.parameters import Limits
-from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import ZERO, Six, Vector, dot, turn_from_vector
 

@@ -16,10 +16,9 @@ from statistics import mean, stdev
 
 from tactile_resonance.contact.envelope import Place, inside
 from tactile_resonance.contact.geometry import ARRIVED_M, TipPath, TurningWay
-from tactile_resonance.contact.goal import REST, Move, State, failed
+from tactile_resonance.contact.goal import REST, Breach, Cause, Move, State, failed
 from tactile_resonance.contact.observer import Observer, Zero
 from tactile_resonance.contact.parameters import REACTION_S, Workspace
-from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import Vector, added, difference, dot, scaled, vector
 

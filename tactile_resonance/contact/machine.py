@@ -20,24 +20,22 @@ from tactile_resonance.contact.goal import (
     REST,
     TARED,
     TOUCHING,
+    Breach,
+    Cause,
     Command,
     ContactGoal,
+    ContactResult,
     HoldMode,
+    Memory,
     Move,
+    NotIdleError,
+    Outcome,
     State,
 )
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import ContactParameters, Limits, check_goal
 from tactile_resonance.contact.pressing import Pressing, TissueMotion
-from tactile_resonance.contact.result import (
-    Breach,
-    Cause,
-    ContactResult,
-    Memory,
-    NotIdleError,
-    Outcome,
-)
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import Vector, dot
 

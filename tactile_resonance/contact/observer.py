@@ -19,8 +19,8 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.contact_filter import ContactFilter
 from tactile_resonance.contact.envelope import ForceWatch
+from tactile_resonance.contact.goal import Breach, Cause
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.result import Breach, Cause
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.contact.vectors import vector
 

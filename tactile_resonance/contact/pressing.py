@@ -21,10 +21,9 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.contact_filter import ContactFilter, hertz_depth
 from tactile_resonance.contact.envelope import Place
 from tactile_resonance.contact.geometry import TipPath
-from tactile_resonance.contact.goal import HoldMode, Move, State, failed
+from tactile_resonance.contact.goal import Cause, HoldMode, Move, State, failed
 from tactile_resonance.contact.observer import Observer
 from tactile_resonance.contact.parameters import REACTION_S, ContactParameters
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample
 
 SURE_SHARE = 0.02

@@ -13,18 +13,21 @@ from rclpy.task import Future
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.cell_checks import require_fit
-from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
+from tactile_resonance.contact.goal import (
+    Aim,
+    Cause,
+    ContactGoal,
+    ContactResult,
+    HoldMode,
+    NotIdleError,
+    State,
+    not_reached,
+    refusal_cause,
+)
 from tactile_resonance.contact.interfaces import ArmError, ForceError, ForceInfo, NodeArm
 from tactile_resonance.contact.loop import Cycle, IndentationRecorder
 from tactile_resonance.contact.machine import PRESSING_CAUSES
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.result import (
-    Cause,
-    ContactResult,
-    NotIdleError,
-    not_reached,
-    refusal_cause,
-)
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.mechanics.indentation import BallTip, Protocol

@@ -17,15 +17,15 @@ from rclpy.action.server import ServerGoalHandle
 from tactile_resonance import msg
 from tactile_resonance.action import MakeContact
 from tactile_resonance.clock import ClockLostError, SimulatedClock
-from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.parameters import check_goal, read_contact
-from tactile_resonance.contact.result import (
+from tactile_resonance.contact.goal import (
     Cause,
     ContactResult,
     NotIdleError,
+    State,
     not_reached,
     refusal_cause,
 )
+from tactile_resonance.contact.parameters import check_goal, read_contact
 from tactile_resonance.nodes.contact_topics import StopInput
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.nodes.messages import (

@@ -54,8 +54,8 @@ from tactile_resonance.srv import ForceOver
 
 if TYPE_CHECKING:  # nodes without contact control do not load it
     from tactile_resonance.contact.contact_filter import ContactEstimate
+    from tactile_resonance.contact.goal import ContactResult
     from tactile_resonance.contact.loop import Cycle
-    from tactile_resonance.contact.result import ContactResult
     from tactile_resonance.contact.samples import Pose, WrenchSample
 
 FRF_STATUS = {status: getattr(msg.FRF, f"STATUS_{status.name}") for status in FrfStatus}

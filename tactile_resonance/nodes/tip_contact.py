@@ -13,8 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
-from tactile_resonance.contact.goal import HoldMode
-from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.goal import Cause, HoldMode
 from tactile_resonance.nodes.goals import POLL_S, GoalClient, Goals, answer_of, wait_for
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import HOLDS

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_resonance.contact.goal import TOUCHING, State
+from tactile_resonance.contact.goal import TOUCHING, Cause, State
 from tactile_resonance.contact.loop import ContactLoop
-from tactile_resonance.contact.result import Cause
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import contact

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmFault, ForceFault, Mount
 from tactile_resonance.contact.parameters import ContactParameters
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import Aim, State
+from tactile_resonance.contact.goal import Aim, Cause, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.parameters import Limits
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.cell.transducer import CellParameters
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -12,8 +12,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, contact, stiffer
 
-from tactile_resonance.contact.goal import State
-from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.goal import Cause, State
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes

@@ -10,13 +10,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tactile_resonance.contact.envelope import WALL_TIME_S, Envelope, ForceWatch, Place
+from tactile_resonance.contact.goal import Cause
 from tactile_resonance.contact.parameters import (
     ContactParameters,
     Limits,
     Workspace,
     read_contact,
 )
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import ZERO, six, vector
 

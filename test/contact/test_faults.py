@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.goal import Cause, State
 from tactile_resonance.contact.interfaces import ArmFault, ForceFault
 from tactile_resonance.contact.parameters import Limits
-from tactile_resonance.contact.result import Cause
 
 sys.path.insert(0, str(Path(__file__).parent))
 import contacts

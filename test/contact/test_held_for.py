@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import Aim, HoldMode, State
+from tactile_resonance.contact.goal import Aim, Cause, HoldMode, State
 from tactile_resonance.contact.loop import IndentationRecorder
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.mechanics.indentation import BallTip, Protocol
 
 sys.path.insert(0, str(Path(__file__).parent))

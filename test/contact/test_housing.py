@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.geometry import TipGeometry
+from tactile_resonance.contact.goal import Cause
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import vector
 

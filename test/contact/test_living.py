@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from benchmarks.contact_living import BONE_ROWS, run_case
-from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.pressing import HeldMotion
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
 from tactile_resonance.simulation.plant.tip import OnSoft, RigidTip, Tip, bone, clinging

@@ -14,12 +14,11 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.clock import WallClock
 from tactile_resonance.contact.cell_checks import require_fit
 from tactile_resonance.contact.geometry import TipGeometry, touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
+from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, HoldMode, NotIdleError, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
-from tactile_resonance.contact.result import Cause, NotIdleError
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.plant.contact_bench import DISH_KG

@@ -17,11 +17,10 @@ from tactile_resonance.contact.geometry import (
     TurningWay,
     touch_pose,
 )
-from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits, Workspace
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.contact.vectors import vector
 from tactile_resonance.simulation.plant.contact_bench import ContactBench

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.goal import Cause, State
 from tactile_resonance.contact.parameters import Limits, Workspace
-from tactile_resonance.contact.result import Cause
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import OnSoft, RigidTip, clinging
 

@@ -17,7 +17,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 
-from tactile_resonance.contact.goal import State
+from tactile_resonance.contact.goal import Cause, ContactResult, State
 from tactile_resonance.contact.parameters import (
     ContactParameters,
     Limits,
@@ -25,7 +25,6 @@ from tactile_resonance.contact.parameters import (
     ranges_of,
     read_contact,
 )
-from tactile_resonance.contact.result import Cause, ContactResult
 from tactile_resonance.nodes import contact_node
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id

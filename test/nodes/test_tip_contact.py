@@ -12,8 +12,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from geometry_msgs.msg import PoseStamped
 
 from tactile_resonance import msg
-from tactile_resonance.contact.goal import HoldMode
-from tactile_resonance.contact.result import Cause
+from tactile_resonance.contact.goal import Cause, HoldMode
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact
 from tactile_resonance.scan.hands import PointDisturbed, ScanEnded
