@@ -32,7 +32,7 @@ from tactile_resonance.calibration.contact import ContactStatus
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_model
-from tactile_resonance.simulation.tissue.hertz import hertz_contact
+from tactile_resonance.simulation.tissue.library import hertz_contact
 
 PROCESSES = 2
 GROUPS = ("natural_rad_s", "damping_ratio", "coupling_rad_s", "tip_deflection")

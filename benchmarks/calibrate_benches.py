@@ -25,8 +25,7 @@ from tactile_resonance.simulation.sensor.experiments import (
     calibration_records,
     true_sensor,
 )
-from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.library import TissueLibrary, read_tissues
+from tactile_resonance.simulation.tissue.library import Tissue, TissueLibrary, read_tissues
 
 MASS_KG, MASS_RELATIVE_STD = 5e-5, 1e-3
 SKEW_STD_S = 2e-6

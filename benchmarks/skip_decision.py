@@ -33,8 +33,7 @@ from tactile_resonance.scan.measurement import MeasurementDesign, excitation_of
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import ScanScene, read_scan_scene
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
-from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.library import TissueLibrary, read_tissues
+from tactile_resonance.simulation.tissue.library import Tissue, TissueLibrary, read_tissues
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import (
     ContactLoad,

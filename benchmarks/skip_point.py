@@ -12,7 +12,7 @@ from tactile_resonance.simulation.sensor.bench import SimulatedBench, convert
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, VaryingStream
 from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream
 from tactile_resonance.simulation.sensor.response import Lines, ResponseStream, sample_period
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 
 
 class SimulatedPoint:

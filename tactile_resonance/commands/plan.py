@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tactile_resonance.poles.result import Poles
     from tactile_resonance.scan.decision import Decision
     from tactile_resonance.scan.plan import Plan
-    from tactile_resonance.simulation.tissue.hertz import Tissue
+    from tactile_resonance.simulation.tissue.library import Tissue
     from tactile_resonance.simulation.tissue.scene import PhantomScene
 
 HELD_S = 1.0

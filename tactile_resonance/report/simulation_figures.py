@@ -16,9 +16,8 @@ from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.sensor.bench import BenchTip, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import pole_trajectory, sensor_modes
 from tactile_resonance.simulation.sensor.experiments import truth_over
-from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter, indent
-from tactile_resonance.simulation.tissue.library import TissueLibrary
+from tactile_resonance.simulation.tissue.library import Tissue, TissueLibrary
 from tactile_resonance.simulation.tissue.scene import PhantomScene, Sphere
 
 

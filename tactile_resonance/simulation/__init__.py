@@ -3,7 +3,7 @@
 
 `sensor/`: `bench` (what the tip touches, blocks of samples), `bimorph` (modes, poles, zeros and response of the
 coupled sensor), `response` and `nonlinear` (its time domain), `experiments` (records of several runs).
-`tissue/`: `scene` (what lies where), `library`, `hertz` (the contact that a small vibration sees),
+`tissue/`: `scene` (what lies where), `library` (tissues, and the contact that a small vibration sees),
 `indenter` (force against depth through time).
 `ur5e/`: the robot and its controller (`controller` is the whole), which know nothing of the rest.
 `cell/`: the load cell (`transducer`) and its buses.

@@ -5,7 +5,7 @@ from benchmarks.calibrate_benches import BAND_HZ, RATE_HZ, excitation
 from tactile_resonance.calibration.estimator import ContactRecord
 from tactile_resonance.simulation.sensor.bench import BenchEffects, BenchRun
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_model
-from tactile_resonance.simulation.tissue.hertz import hertz_contact
+from tactile_resonance.simulation.tissue.library import hertz_contact
 
 SKEW_S = 3e-6
 

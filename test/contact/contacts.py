@@ -14,7 +14,7 @@ from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.contact_bench import ContactBench
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 
 RADIUS_M, FORCE_N = 2.5e-3, 0.01
 SOFT = Tissue("soft", 4.5e3, (1.0,), (0.95,))  # 8.8 kPa at once, 4.5 after 1 s

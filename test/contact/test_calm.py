@@ -16,7 +16,7 @@ from tactile_resonance.contact.goal import Cause, State
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 
 PERIODS = 4
 TISSUE = Tissue("soft", 4.5e3, (1.0,), (0.95,))

@@ -42,7 +42,7 @@ from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
 

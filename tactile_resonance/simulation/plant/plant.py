@@ -30,7 +30,7 @@ from tactile_resonance.contact.vectors import (
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Tip, TipOnTissue
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 from tactile_resonance.simulation.ur5e.poses import IDENTITY, ORIGIN, Transform, beside
 
 NEAR_M = 0.005

@@ -16,7 +16,7 @@ from tactile_resonance.fields import Checked, Range, Seed, require
 
 if TYPE_CHECKING:
     from tactile_resonance.contact.samples import Pose
-    from tactile_resonance.simulation.tissue.hertz import Tissue
+    from tactile_resonance.simulation.tissue.library import Tissue
     from tactile_resonance.simulation.tissue.scene import PhantomScene
 
 

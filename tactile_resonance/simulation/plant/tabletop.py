@@ -32,8 +32,7 @@ from tactile_resonance.simulation.plant.simulated_robot import SimulatedRobot
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
-from tactile_resonance.simulation.tissue.hertz import Tissue
-from tactile_resonance.simulation.tissue.library import TissueLibrary
+from tactile_resonance.simulation.tissue.library import Tissue, TissueLibrary
 
 KEEP_STEPS = 30_000
 """A minute at 500 Hz; a block of the simulated sensor that is longer loses the beginning of its contact."""

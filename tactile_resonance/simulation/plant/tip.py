@@ -12,8 +12,8 @@ import numpy as np
 from tactile_resonance.fields import require
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
 from tactile_resonance.simulation.sensor.bimorph import BeamModes
-from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Beam, Indenter, Motion, swing
+from tactile_resonance.simulation.tissue.library import Tissue
 
 UP_M = 1e-9
 """Over which slopes are taken [m]."""

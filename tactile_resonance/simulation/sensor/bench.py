@@ -27,13 +27,13 @@ from tactile_resonance.simulation.sensor.bimorph import (
     sensor_model,
 )
 from tactile_resonance.simulation.sensor.response import Lines, PoleResidueModel, ResponseStream
-from tactile_resonance.simulation.tissue.hertz import (
+from tactile_resonance.simulation.tissue.library import (
     HertzParameters,
     Tissue,
     contact_of_radius,
     hertz_contact,
+    read_tissues,
 )
-from tactile_resonance.simulation.tissue.library import read_tissues
 
 if TYPE_CHECKING:
     from tactile_resonance.simulation.sensor.nonlinear import NonlinearStream

@@ -33,7 +33,7 @@ from tactile_resonance.cantilever import cantilever_eigenvalues, tip_shape
 from tactile_resonance.fields import require
 from tactile_resonance.sensor import BeamParameters, SensorParameters
 from tactile_resonance.simulation.sensor.response import Lines, PoleResidueModel, ResponseStream
-from tactile_resonance.simulation.tissue.hertz import HertzContact
+from tactile_resonance.simulation.tissue.library import HertzContact
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
 INTERVAL_S = 0.04

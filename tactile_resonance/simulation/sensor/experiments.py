@@ -30,8 +30,7 @@ from tactile_resonance.simulation.sensor.bench import (
 )
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, sensor_model
 from tactile_resonance.simulation.sensor.response import PoleResidueModel
-from tactile_resonance.simulation.tissue.hertz import HertzContact, Tissue
-from tactile_resonance.simulation.tissue.library import read_tissues
+from tactile_resonance.simulation.tissue.library import HertzContact, Tissue, read_tissues
 from tactile_resonance.simulation.tissue.scene import PhantomScene
 
 # Standard deviations; C.

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import require
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 
 NODE_SPACING = 1e-3  # of the profile, in tip radii; the error of unloading goes as its square
 MAX_NODES_PER_STEP = 64

@@ -23,11 +23,11 @@ from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import AboveZero, Checked, build, read_dataclass, read_yaml, require
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
-from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.library import (
     GradientEntry,
     HeterogeneityEntry,
     Material,
+    Tissue,
     TissueEntry,
     TissueLibrary,
     mixture,

@@ -11,7 +11,7 @@ from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tabletop import attach_cell
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 from tactile_resonance.simulation.ur5e.poses import IDENTITY
 
 DT_S, ABOVE_M = 0.002, 2.505e-3

@@ -22,8 +22,8 @@ from tactile_resonance.simulation.plant.tip import (
     bone,
 )
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
-from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
+from tactile_resonance.simulation.tissue.library import Tissue
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
 
 RADIUS_M, NU = 2.5e-3, 0.49

@@ -10,7 +10,7 @@ from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import LaidScene, PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tabletop import move_surface, table_plant
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 from tactile_resonance.simulation.tissue.scene import read_scene
 from tactile_resonance.simulation.ur5e.poses import transform_from_pose
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from tactile_resonance.simulation.tissue.hertz import Tissue, hertz_contact
 from tactile_resonance.simulation.tissue.indenter import Indenter, indent
+from tactile_resonance.simulation.tissue.library import Tissue, hertz_contact
 
 NAMES = ["gel10", "gel12", "gel14", "gel16", "cortex", "white", "liver"]
 RADIUS = 2.5e-3

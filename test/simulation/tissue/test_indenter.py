@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from tactile_resonance.simulation.plant.tip import SprungIndenter
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
-from tactile_resonance.simulation.tissue.hertz import Tissue
 from tactile_resonance.simulation.tissue.indenter import Indenter
+from tactile_resonance.simulation.tissue.library import Tissue
 
 RADIUS, POISSON = 2.5e-3, 0.49
 ELASTIC = Tissue("elastic", 10e3, (1.0,), (0.0,))

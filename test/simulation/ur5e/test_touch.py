@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tip import Tip
-from tactile_resonance.simulation.tissue.hertz import Tissue
+from tactile_resonance.simulation.tissue.library import Tissue
 from tactile_resonance.simulation.ur5e.controller import SafetyMode
 from tactile_resonance.simulation.ur5e.machine import MachineConfig
 
