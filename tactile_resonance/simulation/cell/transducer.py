@@ -23,9 +23,9 @@ from numba.types import UniTuple
 from numpy.typing import NDArray
 
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.vectors import Numbers
 from tactile_resonance.fields import AboveZero, Checked, NotNegative, read_file, require
 from tactile_resonance.simulation.noise import NormalRows, Seed
-from tactile_resonance.simulation.ur5e.poses import Six
 
 Counts = tuple[int, ...]
 """Of the six axes, and overload bits."""
@@ -219,7 +219,7 @@ class Transducer:
         self._axes["zero"] = self._axes["signal"] + self._axes["noise"] if on else 0.0
 
     def convert(
-        self, load: Six, before: Six, start_s: float, span_s: float, count: int
+        self, load: Numbers, before: Numbers, start_s: float, span_s: float, count: int
     ) -> NDArray[np.uint8]:
         """Convert some times, once a period.
 
@@ -249,7 +249,7 @@ class Transducer:
         self._read = self._noisy = True
         return responses
 
-    def convert_once(self, load: Six) -> Counts:
+    def convert_once(self, load: Numbers) -> Counts:
         """Convert once: from the wrench on the cell, 6 [N, N m], to six counts and, last, overload bits."""
         response = self.convert(load, load, 0.0, SAMPLE_PERIOD_S, 1)
         return WRENCH.unpack_from(response.tobytes())[1:]

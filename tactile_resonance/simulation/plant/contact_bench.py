@@ -33,7 +33,7 @@ from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.contact.payload import Mounting, Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
-from tactile_resonance.contact.vectors import nearer, six, vector
+from tactile_resonance.contact.vectors import nearer, six, transform_from_pose, vector
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.sensor import SensorParameters
 from tactile_resonance.simulation.cell.transducer import NO_NUMBER, CellParameters, Transducer
@@ -44,7 +44,6 @@ from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.library import Tissue
 from tactile_resonance.simulation.ur5e.machine import Lag, TrackingParameters
-from tactile_resonance.simulation.ur5e.poses import transform_from_pose
 
 PROTECTIVE_DECELERATION_M_S2 = 2.0
 """With which the robot brakes without a command (chosen)."""

@@ -18,9 +18,13 @@ from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import GRAVITY_M_S2, Payload
 from tactile_resonance.contact.vectors import (
+    IDENTITY,
+    ZERO,
     Six,
+    Transform,
     Vector,
     added,
+    beside,
     cross,
     difference,
     rotated,
@@ -31,7 +35,6 @@ from tactile_resonance.fields import require
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tip import Tip, TipOnTissue
 from tactile_resonance.simulation.tissue.library import Tissue
-from tactile_resonance.simulation.ur5e.poses import IDENTITY, ORIGIN, Transform, beside
 
 NEAR_M = 0.005
 """Below this height the tip is stepped on its tissue: a beam that swings before it touches."""
@@ -49,7 +52,7 @@ POISSON_RATIO = 0.49
 SLIP = 2 * (1 - POISSON_RATIO) / (2 - POISSON_RATIO)
 """Tangential over normal stiffness of the contact before it slips (Mindlin 1949)."""
 
-_NOTHING = Payload(0.0, ORIGIN)
+_NOTHING = Payload(0.0, ZERO)
 
 
 class Plant:
@@ -117,20 +120,20 @@ class Plant:
         self.mount, self.carried = mount, carried
         self.friction = friction
         self.time_s = 0.0
-        self.force_n = self.torque_nm = ORIGIN
+        self.force_n = self.torque_nm = ZERO
         self.depth_m = self.contact_radius_m = 0.0
         self.in_contact = False
         self.touches = 0
         self.contact_s = 0.0
-        self.tip_m = ORIGIN
+        self.tip_m = ZERO
         self.normal_force_n = 0.0
         self.tissue: Tissue | None = None
         self._on: TipOnTissue | None = None
         self.site_m: Vector | None = None
         self._site_touched = False
-        self._slip = ORIGIN  # elastic displacement of the contact along the surface
+        self._slip = ZERO  # elastic displacement of the contact along the surface
         self._lateral_n_per_m = 0.0  # its stiffness there
-        self._held_n = ORIGIN  # force on what holds the tip: the beam's, where there is one
+        self._held_n = ZERO  # force on what holds the tip: the beam's, where there is one
         self._turn = IDENTITY[0]  # of the tip
         self._stepped = False
         self._gravity_m_s2 = vector(GRAVITY_M_S2)
@@ -144,7 +147,7 @@ class Plant:
         For a beam that is where the undeflected tip would be.
         """
         self._turn, place = tip
-        way = difference(place, self.tip_m) if self._stepped else ORIGIN
+        way = difference(place, self.tip_m) if self._stepped else ZERO
         self._stepped, self._period_s = True, dt_s
         self.time_s += dt_s
         height, normal = self.surface.height_of(place)
@@ -167,7 +170,7 @@ class Plant:
         self.contact_s = self.contact_s + dt_s if touching else 0.0
         self.tip_m, self.normal_force_n = place, pushed
         if held == 0.0 == pushed:
-            self.force_n = self._held_n = self.torque_nm = self._slip = ORIGIN
+            self.force_n = self._held_n = self.torque_nm = self._slip = ZERO
         else:
             x, y, z = self._friction(way, normal, pushed)
             nx, ny, nz = normal
@@ -188,14 +191,14 @@ class Plant:
         """
         if not self._stepped:
             raise RuntimeError("wrench_at_cell: the plant has not been stepped yet")
-        untouched = self.force_n is ORIGIN and self.mount is Mount.TABLE
+        untouched = self.force_n is ZERO and self.mount is Mount.TABLE
         if untouched and self._unloaded is not None:
             return self._unloaded
         mass = self.carried.mass_kg
         gx, gy, gz = self._gravity_m_s2
         cx, cy, cz = self.torque_nm
         if self.mount is Mount.TABLE:
-            turn, origin, centre = IDENTITY[0], ORIGIN, self.carried.centre_m
+            turn, origin, centre = IDENTITY[0], ZERO, self.carried.centre_m
             fx, fy, fz = self.force_n
             fx, fy, fz, cx, cy, cz = -fx, -fy, -fz, -cx, -cy, -cz
         else:
@@ -240,8 +243,8 @@ class Plant:
         shrinks keeps the displacement. So it gives no energy (Mindlin & Deresiewicz 1953).
         """
         if pushed <= 0 or self.depth_m <= 0:
-            self._slip = ORIGIN
-            return ORIGIN
+            self._slip = ZERO
+            return ZERO
         stiffness = SLIP * 1.5 * pushed / self.depth_m
         kept = min(1.0, self._lateral_n_per_m / stiffness)
         self._lateral_n_per_m = stiffness
@@ -257,7 +260,7 @@ class Plant:
     def _mass_acceleration(self) -> Vector:
         """Of the carried mass [m/s2], by differences over the last two periods."""
         if len(self._places) < 3:
-            return ORIGIN
+            return ZERO
         first, second, third = self._places
         (x, y, z), (lx, ly, lz) = difference(third, second), difference(second, first)
         square = self._period_s**2

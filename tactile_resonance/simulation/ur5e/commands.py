@@ -15,17 +15,19 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
-from tactile_resonance.contact.vectors import NO_TURN, Vector, rotated
+from tactile_resonance.contact.vectors import (
+    NO_TURN,
+    Numbers,
+    Transform,
+    Vector,
+    pose_from_transform,
+    rotated,
+    transform_from_pose,
+)
 from tactile_resonance.simulation.ur5e import motion
 from tactile_resonance.simulation.ur5e.forces import ForceTask, ToolPayload
 from tactile_resonance.simulation.ur5e.kinematics import Posture, product
 from tactile_resonance.simulation.ur5e.machine import Machine
-from tactile_resonance.simulation.ur5e.poses import (
-    Six,
-    Transform,
-    pose_from_transform,
-    transform_from_pose,
-)
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError, Thread
 from tactile_resonance.simulation.ur5e.variables import (
     DOUBLE_INPUTS,
@@ -264,7 +266,7 @@ class Program:
         *speeds, acceleration, time_s = self.doubles(0, 8)
         self._keep("speed", run, tuple(speeds), acceleration, time_s)
 
-    def _servo(self, goal: Six) -> None:
+    def _servo(self, goal: Numbers) -> None:
         """Follow joint angles."""
         gain = self.double(10)
         if not 100 <= gain <= 2000:
@@ -346,7 +348,7 @@ class Program:
             raise ScriptError(f"force_mode_set_{name}: {value:g}; accepted is 0 to {most:g}")
         setattr(self._machine.force_mode, name, value)
 
-    def _set_payload(self, inertia: Six) -> None:
+    def _set_payload(self, inertia: Numbers) -> None:
         """Set mass and centre of gravity of what the flange carries."""
         mass, cog = self.double(0), self.vector(1)
         if not mass >= 0.0:

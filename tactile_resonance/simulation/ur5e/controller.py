@@ -20,10 +20,10 @@ from enum import IntEnum
 
 import numpy as np
 
+from tactile_resonance.contact.vectors import largest
 from tactile_resonance.simulation.noise import Seed
 from tactile_resonance.simulation.ur5e.commands import Program
 from tactile_resonance.simulation.ur5e.machine import Environment, Machine, MachineConfig
-from tactile_resonance.simulation.ur5e.poses import largest
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ProtectiveStop, ScriptError
 from tactile_resonance.simulation.ur5e.variables import (
     INT_INPUTS,

@@ -8,15 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_resonance.contact.vectors import Turn, Vector, cross, rotated, rotated_back
-from tactile_resonance.simulation.noise import ROWS
-from tactile_resonance.simulation.ur5e.poses import (
-    ORIGIN,
+from tactile_resonance.contact.vectors import (
     ZERO,
-    Six,
+    ZEROS,
+    Numbers,
     Transform,
+    Turn,
+    Vector,
     beside,
+    cross,
+    rotated,
+    rotated_back,
 )
+from tactile_resonance.simulation.noise import ROWS
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -44,8 +48,8 @@ class ToolPayload:
     """
 
     mass_kg: float = 0.0
-    cog_m: Vector = ORIGIN
-    inertia_kg_m2: Six = ZERO
+    cog_m: Vector = ZERO
+    inertia_kg_m2: Numbers = ZEROS
 
 
 class FtSensor:
@@ -72,7 +76,7 @@ class FtSensor:
         """Take all noise from the next step on from a generator, drift drawn anew; the offset stays."""
         self._random = random
         self._drift = self._drift_rms * random.standard_normal(6)
-        self._errors: list[Six] = []  # what is read beside the truth, that of the next cycle last
+        self._errors: list[Numbers] = []  # what is read beside the truth, that of the next cycle last
 
     def _draw(self) -> None:
         """Find offset, drift and noise of the next cycles."""
@@ -82,7 +86,7 @@ class FtSensor:
         errors = self._offset + drifts + numbers[:, 6:]
         self._errors = [*map(tuple, errors[::-1].tolist())]
 
-    def error(self) -> Six:
+    def error(self) -> Numbers:
         """Return what it reads in the next cycle beside the truth, at and in the flange [N], [N m]."""
         if not self._errors:
             self._draw()
@@ -118,9 +122,9 @@ class ForceTask:
 
     frame: Transform
     selection: tuple[bool, ...]
-    wrench: Six
+    wrench: Numbers
     kind: int
-    limits: Six
+    limits: Numbers
 
     def __post_init__(self) -> None:
         if self.kind not in (1, 2, 3):
@@ -146,7 +150,7 @@ class ForceMode:
         self._target = target
         self.gain_scaling = 1.0
         self.damping = 0.005
-        self._speed = ZERO
+        self._speed = ZEROS
 
     def begin(self, task: ForceTask) -> None:
         """Enter force mode, or go on with another task."""
@@ -158,9 +162,9 @@ class ForceMode:
         """Leave force mode."""
         self.task = None
         self._target.yield_began_q = None
-        self._speed = ZERO
+        self._speed = ZEROS
 
-    def step(self, measured: Six) -> None:
+    def step(self, measured: Numbers) -> None:
         """Move the target aside for one cycle of force mode; raises as `Target.command`.
 
         Parameters

@@ -20,8 +20,7 @@ import math
 from numba import boolean, float64, njit, void
 from numba.types import UniTuple
 
-from tactile_resonance.contact.vectors import Vector, cross
-from tactile_resonance.simulation.ur5e.poses import IDENTITY, Six, Transform
+from tactile_resonance.contact.vectors import IDENTITY, Numbers, Transform, Vector, cross
 
 # Figures of the table. Lengths in m; the twists alpha are 90, 0, 0, 90, -90 and 0 degrees.
 D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
@@ -156,7 +155,7 @@ class Posture:
 
     __slots__ = ("_numbers", "_tools", "flange", "q")
 
-    def __init__(self, q: Six) -> None:
+    def __init__(self, q: Numbers) -> None:
         self.q = q
         numbers = _posture(q)
         self.flange: Transform = numbers[:9], numbers[9:12]
@@ -172,7 +171,7 @@ class Posture:
         self._tools.append((tcp, tool))
         return tool
 
-    def twist(self, point_m: Vector, qd: Six) -> Six:
+    def twist(self, point_m: Vector, qd: Numbers) -> Numbers:
         """Return the velocity [m/s] of a point that the flange carries and its angular velocity [rad/s].
 
         Parameters
@@ -184,7 +183,7 @@ class Posture:
         """
         return _twist(self._numbers, point_m, qd)
 
-    def torques(self, point_m: Vector, wrench: Six) -> Six:
+    def torques(self, point_m: Vector, wrench: Numbers) -> Numbers:
         """Return the torques [N m] of the joints that a wrench [N, N m] at a point in the base exerts."""
         s1, c1, s234, c234, s5, c5, r2, h2, r3, h3, r4, h4 = self._numbers
         fx, fy, fz, mx, my, mz = wrench
@@ -281,7 +280,7 @@ def _nearest(turn, place_m, near):
     return best
 
 
-def nearest_inverse(flange: Transform, near: Six) -> Six | None:
+def nearest_inverse(flange: Transform, near: Numbers) -> Numbers | None:
     """Return the joint angles for a place of the flange that are nearest to given ones.
 
     Parameters

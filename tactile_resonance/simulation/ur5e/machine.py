@@ -15,7 +15,19 @@ from typing import Protocol
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.vectors import Vector, dot
+from tactile_resonance.contact.vectors import (
+    ZERO,
+    ZEROS,
+    Numbers,
+    Transform,
+    Vector,
+    dot,
+    largest,
+    minus,
+    pose_from_transform,
+    rounded,
+    transform_from_pose,
+)
 from tactile_resonance.fields import AboveZero, Checked, NotNegative
 from tactile_resonance.simulation.noise import Jitter
 from tactile_resonance.simulation.ur5e.forces import (
@@ -41,17 +53,6 @@ from tactile_resonance.simulation.ur5e.kinematics import (
     behind,
     feel,
     follow,
-)
-from tactile_resonance.simulation.ur5e.poses import (
-    ORIGIN,
-    ZERO,
-    Six,
-    Transform,
-    difference,
-    largest,
-    pose_from_transform,
-    rounded,
-    transform_from_pose,
 )
 from tactile_resonance.simulation.ur5e.target import CYCLE_S, ScriptError, Target, rate
 
@@ -155,8 +156,8 @@ class MachineConfig:
         published; this is the model's.
     """
 
-    start_q: Six = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
-    tip_in_flange: Six = ZERO
+    start_q: Numbers = (0.0, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0)
+    tip_in_flange: Numbers = ZEROS
     tool: ToolPayload = field(default_factory=ToolPayload)
     tracking: TrackingParameters = field(default_factory=TrackingParameters)
     ft_errors: float = 1.0
@@ -200,8 +201,8 @@ class Machine:
         self.payload = config.tool
         self.gravity_m_s2: Vector = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)
         self.external: tuple[ToolPayload, Vector] | None = None
-        self.external_wrench = ZERO
-        self.tremble_m: Vector = ORIGIN
+        self.external_wrench = ZEROS
+        self.tremble_m: Vector = ZERO
         self.pressed_n = 0.0
         self._arm = np.zeros((ARM_ROWS, 12))
         # parts of it that are read in each cycle
@@ -213,7 +214,7 @@ class Machine:
         self._arm[TIP] = *turn, *place
         self._set: tuple = ()  # what of the program's settings stands in the arm's state
         # TCP of which the pose was told last, and it
-        self._posed: tuple[list[float], Six] = ([], ZERO)
+        self._posed: tuple[list[float], Numbers] = ([], ZEROS)
         self._rest_cycles = 0
         # joint angles and wrench on the TCP, (12,)
         self._history: deque[FloatArray] = deque(maxlen=HISTORY)
@@ -221,17 +222,17 @@ class Machine:
         self._observe()
 
     @property
-    def q(self) -> Six:
+    def q(self) -> Numbers:
         """Angles that the joints' encoders say [rad]."""
         return tuple(self._q.tolist())
 
     @property
-    def qd(self) -> Six:
+    def qd(self) -> Numbers:
         """Speeds of the joints [rad/s]."""
         return tuple(self._qd.tolist())
 
     @property
-    def qdd(self) -> Six:
+    def qdd(self) -> Numbers:
         """Accelerations of the joints [rad/s^2]."""
         return rate(tuple(self._arm[SPEEDS, 6:].tolist()), self.qd)
 
@@ -247,7 +248,7 @@ class Machine:
         return tuple(turn), (x, y, z)
 
     @property
-    def tcp_pose(self) -> Six:
+    def tcp_pose(self) -> Numbers:
         """Its pose."""
         numbers = self._arm[TOOL].tolist()
         if self._posed[0] != numbers:  # that of an arm at rest stays
@@ -255,24 +256,24 @@ class Machine:
         return self._posed[1]
 
     @property
-    def tcp_twist(self) -> Six:
+    def tcp_twist(self) -> Numbers:
         """Actual twist of the TCP in the base [m/s, rad/s]."""
         return tuple(self._twist.tolist())
 
     @property
-    def tcp_force(self) -> Six:
+    def tcp_force(self) -> Numbers:
         """Measured wrench on the TCP, along the axes of the base, payload and offset compensated."""
         return tuple(self._wrench.tolist())
 
     @property
-    def raw_wrench(self) -> Six:
+    def raw_wrench(self) -> Numbers:
         """Measured at the flange, in its frame, nothing compensated (``ft_raw_wrench``)."""
         return tuple(self._raw.tolist())
 
     @property
-    def outer_torque(self) -> Six:
+    def outer_torque(self) -> Numbers:
         """Torques [N m] of the joints against the measured force on the tool."""
-        return difference(ZERO, self.posture.torques(self.tcp[1], self.tcp_force))
+        return minus(ZEROS, self.posture.torques(self.tcp[1], self.tcp_force))
 
     @property
     def steady(self) -> bool:
@@ -283,7 +284,7 @@ class Machine:
     def rests(self) -> bool:
         """At rest for a second, and its tool touches nothing."""
         environment = self.environment
-        free = environment is None or environment.force_n == ORIGIN == environment.torque_nm
+        free = environment is None or environment.force_n == ZERO == environment.torque_nm
         return self._rest_cycles >= REST_CYCLES and free
 
     def reseed(self, random: np.random.Generator) -> None:
@@ -311,11 +312,11 @@ class Machine:
         self._arm[SPEEDS] = self._arm[TWIST, :6] = 0.0
         self.target.hold(self.q)
 
-    def solve(self, tool: Transform, q_near: Six | None = None) -> Six | None:
+    def solve(self, tool: Transform, q_near: Numbers | None = None) -> Numbers | None:
         """Return joint angles that bring the TCP to a place in the base; None out of reach."""
         return self.target.solve(tool, self.q if q_near is None else q_near)
 
-    def solved(self, tool: Transform, q_near: Six | None = None) -> Six:
+    def solved(self, tool: Transform, q_near: Numbers | None = None) -> Numbers:
         """Return joint angles as `solve`; raises ScriptError out of reach."""
         q = self.solve(tool, q_near)
         if q is None:
@@ -324,11 +325,11 @@ class Machine:
             )
         return q
 
-    def within_limits(self, q: Six | None) -> bool:
+    def within_limits(self, q: Numbers | None) -> bool:
         """Say whether joint angles, or None for a pose out of reach, are within the limits."""
         return q is not None and largest(q) <= JOINT_RANGE_RAD
 
-    def past_joints(self, steps: int) -> Six:
+    def past_joints(self, steps: int) -> Numbers:
         """Return the joint angles of some cycles ago.
 
         Raises
@@ -372,7 +373,7 @@ class Machine:
         lag, tcp = self._lag, self.target.tcp
         wanted = (tcp, self.payload, self.gravity_m_s2, self.external, self.external_wrench)
         if wanted != self._set:
-            own, own_m = self.external or (ToolPayload(), ORIGIN)
+            own, own_m = self.external or (ToolPayload(), ZERO)
             self._arm[TCP] = *tcp[0], *tcp[1]
             masses = [(mass.mass_kg, *mass.cog_m) for mass in (self.config.tool, self.payload, own)]
             self._arm[MASSES] = np.ravel(masses)
@@ -382,7 +383,7 @@ class Machine:
 
     def _observe(self) -> None:
         """Touch what is there with the tip and measure the wrench at the flange."""
-        force = torque = ORIGIN
+        force = torque = ZERO
         if self.environment is not None:
             *turn, x, y, z = self._arm[TOUCH].tolist()
             self.environment.step((tuple(turn), (x, y, z)), CYCLE_S)

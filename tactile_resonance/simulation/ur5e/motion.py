@@ -12,18 +12,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from tactile_resonance.contact.vectors import transposed, turn_product
-from tactile_resonance.simulation.ur5e.kinematics import JOINT_SPEED_RAD_S, Posture
-from tactile_resonance.simulation.ur5e.poses import (
-    ZERO,
-    Six,
+from tactile_resonance.contact.vectors import (
+    ZEROS,
+    Numbers,
     Transform,
-    difference,
     largest,
-    total,
+    minus,
+    plus,
+    transposed,
     turn_between,
+    turn_product,
     turned,
 )
+from tactile_resonance.simulation.ur5e.kinematics import JOINT_SPEED_RAD_S, Posture
 from tactile_resonance.simulation.ur5e.target import (
     CYCLE_S,
     TOOL_SPEED_M_S,
@@ -85,7 +86,7 @@ _SLOWEST = 1e-9
 SERVO_ACCELERATION_RAD_S2 = 40.0
 
 
-def movej(target: Target, goal: Six, acceleration: float, speed: float) -> Thread:
+def movej(target: Target, goal: Numbers, acceleration: float, speed: float) -> Thread:
     """Move all joints to `goal`, together; acceleration [rad/s^2] and speed of the leading one.
 
     Begun in motion, it brakes first. The speed is lowered where a joint or the TCP would pass its
@@ -95,7 +96,7 @@ def movej(target: Target, goal: Six, acceleration: float, speed: float) -> Threa
     _require_positive("movej", "speed", speed)
     yield from stopj(target, acceleration)
     start = target.q
-    way_to_go = difference(goal, start)
+    way_to_go = minus(goal, start)
     length = largest(way_to_go)
     if length == 0.0:
         return
@@ -118,7 +119,7 @@ def movej(target: Target, goal: Six, acceleration: float, speed: float) -> Threa
         q = goal if way == length else _along(start, direction, way)
         pace = rate * target.pace
         target.command(
-            total(q, difference(target.yielded_q, yielded)),
+            plus(q, minus(target.yielded_q, yielded)),
             tuple([share * pace for share in direction]),
         )
         yield
@@ -134,7 +135,7 @@ def movel(target: Target, goal: Transform, acceleration: float, speed: float) ->
     _require_positive("movel", "speed", speed)
     yield from stopl(target, acceleration)
     start = target.tool
-    shift = difference(goal[1], start[1])
+    shift = minus(goal[1], start[1])
     turn = turn_between(start, goal)
     length = max(math.hypot(*shift), math.hypot(*turn))
     if length == 0.0:
@@ -151,7 +152,7 @@ def movel(target: Target, goal: Transform, acceleration: float, speed: float) ->
             x, y, z, rx, ry, rz = (value * way for value in direction)
             tool = turned(start, (x, y, z), (rx, ry, rz))
         aside = turn_product(target.yielded_turn, yielded_back)
-        x, y, z = total(tool[1], difference(target.yielded_m, yielded_m))
+        x, y, z = plus(tool[1], minus(target.yielded_m, yielded_m))
         pace = rate * target.pace
         target.command_tool(
             (turn_product(aside, tool[0]), (x, y, z)), tuple([value * pace for value in direction])
@@ -159,7 +160,7 @@ def movel(target: Target, goal: Transform, acceleration: float, speed: float) ->
         yield
 
 
-def speedl(target: Target, twist: Six, acceleration: float, time_s: float = 0.0) -> Thread:
+def speedl(target: Target, twist: Numbers, acceleration: float, time_s: float = 0.0) -> Thread:
     """Bring the TCP to a twist [m/s, rad/s] in the base.
 
     Returns after `time_s`, or once the twist is reached where that is 0. The acceleration [m/s^2]
@@ -172,7 +173,7 @@ def speedl(target: Target, twist: Six, acceleration: float, time_s: float = 0.0)
     yield from _repeated(lambda: _step_twist(target, goal, acceleration), time_s)
 
 
-def speedj(target: Target, speeds: Six, acceleration: float, time_s: float = 0.0) -> Thread:
+def speedj(target: Target, speeds: Numbers, acceleration: float, time_s: float = 0.0) -> Thread:
     """Bring the joints to speeds [rad/s]; `acceleration` [rad/s^2] is that of the leading one.
 
     Returns after `time_s`, or once the speeds are reached where that is 0.
@@ -198,7 +199,7 @@ def stopl(target: Target, deceleration: float) -> Thread:
     """Stop the TCP on a straight line; deceleration [m/s^2], numerically that of turning too."""
     _require_positive("stopl", "deceleration", deceleration)
     while any(target.qd):
-        _step_twist(target, ZERO, deceleration, straight=True)
+        _step_twist(target, ZEROS, deceleration, straight=True)
         yield
 
 
@@ -206,11 +207,11 @@ def stopj(target: Target, deceleration: float) -> Thread:
     """Stop the joints in proportion; deceleration of the leading one [rad/s^2]."""
     _require_positive("stopj", "deceleration", deceleration)
     while any(target.qd):
-        _step_joints(target, ZERO, deceleration)
+        _step_joints(target, ZEROS, deceleration)
         yield
 
 
-def servoj(target: Target, goal: Six, time_s: float, lookahead_s: float) -> Thread:
+def servoj(target: Target, goal: Numbers, time_s: float, lookahead_s: float) -> Thread:
     """Follow joint angles `goal` for a time, beside them by what force mode has yielded.
 
     The model's choice: the joints approach the goal with the look-ahead time as time constant, under
@@ -222,13 +223,13 @@ def servoj(target: Target, goal: Six, time_s: float, lookahead_s: float) -> Thre
     if not time_s > 0.0:
         raise ScriptError(f"servoj: t {time_s:g}; accepted is above 0 s")
     for _ in range(max(1, round(time_s / CYCLE_S))):
-        missing = difference(total(goal, target.aside_q), target.q)
+        missing = minus(plus(goal, target.aside_q), target.q)
         wanted = tuple([angle / lookahead_s * target.pace for angle in missing])
         _step_joints(target, wanted, SERVO_ACCELERATION_RAD_S2)
         yield
 
 
-def _step_twist(target: Target, goal: Six, acceleration: float, straight: bool = False) -> bool:
+def _step_twist(target: Target, goal: Numbers, acceleration: float, straight: bool = False) -> bool:
     """Change the twist towards `goal` by one cycle and say whether it is there."""
     if not any(goal) and not any(target.qd):
         target.stay()
@@ -236,19 +237,19 @@ def _step_twist(target: Target, goal: Six, acceleration: float, straight: bool =
     return target.command_towards(goal, acceleration, straight=straight)
 
 
-def _step_joints(target: Target, goal: Six, acceleration: float) -> bool:
+def _step_joints(target: Target, goal: Numbers, acceleration: float) -> bool:
     """Change the joints' speeds towards `goal` by one cycle and say whether they are there."""
-    missing = difference(goal, target.qd)
+    missing = minus(goal, target.qd)
     fastest = largest(missing)
     allowed = acceleration * CYCLE_S
     reached = fastest <= allowed
     new = goal if reached else _along(target.qd, missing, allowed / fastest)
-    mean = total(target.qd, new)
+    mean = plus(target.qd, new)
     target.command(_along(target.q, mean, CYCLE_S / 2), new)
     return reached
 
 
-def _along(start: Six, direction: Six, way: float) -> Six:
+def _along(start: Numbers, direction: Numbers, way: float) -> Numbers:
     """Return ``start + way direction``, six numbers."""
     return tuple([a + b * way for a, b in zip(start, direction, strict=True)])
 

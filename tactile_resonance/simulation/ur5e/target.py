@@ -7,7 +7,25 @@ import math
 from collections.abc import Generator
 from operator import sub
 
-from tactile_resonance.contact.vectors import NO_TURN, Turn, Vector, transposed, turn_product
+from tactile_resonance.contact.vectors import (
+    IDENTITY,
+    NO_TURN,
+    ZERO,
+    ZEROS,
+    Numbers,
+    Transform,
+    Turn,
+    Vector,
+    inverse_transform,
+    largest,
+    minus,
+    plus,
+    pose_from_transform,
+    rounded,
+    transposed,
+    turn_product,
+    turned,
+)
 from tactile_resonance.simulation.ur5e.kinematics import (
     JOINT_RANGE_RAD,
     JOINT_SPEED_RAD_S,
@@ -16,20 +34,6 @@ from tactile_resonance.simulation.ur5e.kinematics import (
     motion_towards,
     nearest_inverse,
     product,
-)
-from tactile_resonance.simulation.ur5e.poses import (
-    IDENTITY,
-    ORIGIN,
-    ZERO,
-    Six,
-    Transform,
-    difference,
-    inverse_transform,
-    largest,
-    pose_from_transform,
-    rounded,
-    total,
-    turned,
 )
 
 # The control period of an e-series [s].
@@ -74,18 +78,18 @@ class Target:
         `yielded_q` when force mode began; None without it.
     """
 
-    def __init__(self, q: Six) -> None:
+    def __init__(self, q: Numbers) -> None:
         self._tcp = self._flange_in_tcp = IDENTITY
         self.pace = 1.0
         self.q, self._posture = q, Posture(q)
-        self.qd = ZERO
-        self._cycle_qd = ZERO
-        self._accelerated: tuple[Six, Six] = (ZERO, ZERO)  # from and to, in the last whole cycle
+        self.qd = ZEROS
+        self._cycle_qd = ZEROS
+        self._accelerated: tuple[Numbers, Numbers] = (ZEROS, ZEROS)  # from and to, in the last whole cycle
         self.commanded = False
-        self.yielded_q = ZERO
-        self.yielded_m: Vector = ORIGIN
+        self.yielded_q = ZEROS
+        self.yielded_m: Vector = ZERO
         self.yielded_turn: Turn = NO_TURN
-        self.yield_began_q: Six | None = None
+        self.yield_began_q: Numbers | None = None
 
     @property
     def tcp(self) -> Transform:
@@ -104,15 +108,15 @@ class Target:
         return self._posture
 
     @property
-    def qdd(self) -> Six:
+    def qdd(self) -> Numbers:
         """Target accelerations [rad/s^2]."""
         return rate(*self._accelerated)
 
     @property
-    def aside_q(self) -> Six:
+    def aside_q(self) -> Numbers:
         """How far force mode has moved the joints aside since it began; 0 without it."""
         return (
-            ZERO if self.yield_began_q is None else difference(self.yielded_q, self.yield_began_q)
+            ZEROS if self.yield_began_q is None else minus(self.yielded_q, self.yield_began_q)
         )
 
     @property
@@ -121,12 +125,12 @@ class Target:
         return self.posture.tool(self._tcp)
 
     @property
-    def pose(self) -> Six:
+    def pose(self) -> Numbers:
         """Target pose of the TCP in the base."""
         return pose_from_transform(self.tool)
 
     @property
-    def twist(self) -> Six:
+    def twist(self) -> Numbers:
         """Target velocity [m/s] and angular velocity [rad/s] of the TCP in the base."""
         return self.posture.twist(self.tool[1], self.qd)
 
@@ -141,7 +145,7 @@ class Target:
             self._brake()
         self._accelerated = self._cycle_qd, self.qd
 
-    def command(self, q: Six, qd: Six, *, within: bool = False) -> None:
+    def command(self, q: Numbers, qd: Numbers, *, within: bool = False) -> None:
         """Set target angles and speeds for this cycle; those known to be `within` all limits are not looked at.
 
         Raises
@@ -158,11 +162,11 @@ class Target:
             self._check(q, qd)
         self.commanded, self.q, self.qd = True, q, qd
 
-    def command_tool(self, tool: Transform, twist: Six) -> None:
+    def command_tool(self, tool: Transform, twist: Numbers) -> None:
         """Set the target TCP and its twist for this cycle; raises as `command`."""
         self.command(*self._motion_to(tool, twist))
 
-    def command_towards(self, goal: Six, acceleration: float, *, straight: bool) -> bool:
+    def command_towards(self, goal: Numbers, acceleration: float, *, straight: bool) -> bool:
         """Bring the target twist nearer to a goal in this cycle, and say whether it is there.
 
         Acceleration [m/s^2], numerically that of turning too [rad/s^2]; when stopping `straight`, moving and
@@ -180,15 +184,15 @@ class Target:
     def stay(self) -> None:
         """Stand still in this cycle, where the arm stands already; raises as `command`."""
         self._require_turn()
-        self.commanded, self.qd = True, ZERO
+        self.commanded, self.qd = True, ZEROS
 
     def shift(self, shift_m: Vector, turn_rad: Vector) -> None:
         """Move the target TCP aside by a compliance, beside what the program commands."""
         before = self.tool
         aside = turned(before, shift_m, turn_rad)
-        q, _ = self._motion_to(aside, ZERO)
+        q, _ = self._motion_to(aside, ZEROS)
         self._check(q)
-        self.yielded_q = total(self.yielded_q, difference(q, self.q))
+        self.yielded_q = plus(self.yielded_q, minus(q, self.q))
         x, y, z = self.yielded_m
         self.yielded_m = (x + shift_m[0], y + shift_m[1], z + shift_m[2])
         turn = turn_product(aside[0], transposed(before[0]))
@@ -205,15 +209,15 @@ class Target:
         self.q = tuple([max(-limit, min(limit, q)) for q in reached])
         self.qd = tuple([qd * share for qd in self.qd])
 
-    def hold(self, q: Six) -> None:
+    def hold(self, q: Numbers) -> None:
         """Stand still at joint angles."""
-        self.q, self.qd = q, ZERO
+        self.q, self.qd = q, ZEROS
 
-    def solve(self, tool: Transform, q_near: Six) -> Six | None:
+    def solve(self, tool: Transform, q_near: Numbers) -> Numbers | None:
         """Return the joint angles for a TCP in the base, nearest to `q_near`; None out of reach."""
         return nearest_inverse(product(tool, self._flange_in_tcp), q_near)
 
-    def _motion_to(self, tool: Transform, twist: Six) -> tuple[Six, Six]:
+    def _motion_to(self, tool: Transform, twist: Numbers) -> tuple[Numbers, Numbers]:
         """Return angles and speeds of the joints for a TCP in the base, nearest to the present ones."""
         numbers = motion_to(*tool, twist, self.q, *self._tcp, *self._flange_in_tcp)
         if numbers[12] == math.inf:
@@ -224,7 +228,7 @@ class Target:
         if self.commanded:
             raise ScriptError("another thread is already controlling the robot")
 
-    def _check(self, q: Six, qd: Six = ZERO) -> None:
+    def _check(self, q: Numbers, qd: Numbers = ZEROS) -> None:
         """Refuse angles out of limits, and speeds: those given and those with which it is reached."""
         reached = largest(q)
         if reached > JOINT_RANGE_RAD:
@@ -244,6 +248,6 @@ def _out_of_reach(tool: Transform) -> ProtectiveStop:
     return ProtectiveStop(f"no joint angles reach the position {rounded(tool[1])} m")
 
 
-def rate(before: Six, now: Six) -> Six:
+def rate(before: Numbers, now: Numbers) -> Numbers:
     """Return by how much six numbers change in a second, from their change in a cycle."""
     return tuple([change / CYCLE_S for change in map(sub, now, before)])

@@ -12,8 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from tactile_resonance.contact.vectors import Vector, rotated_back
-from tactile_resonance.simulation.ur5e.poses import ZERO, pose_from_transform
+from tactile_resonance.contact.vectors import ZEROS, Vector, pose_from_transform, rotated_back
 
 if TYPE_CHECKING:
     from tactile_resonance.simulation.ur5e.controller import UrController
@@ -188,7 +187,7 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
             *("target_current", "target_moment", "actual_moment", "actual_current"),
             *("actual_current_as_torque", "joint_control_output"),
         ),
-        ("VECTOR6D", lambda robot: ZERO),
+        ("VECTOR6D", lambda robot: ZEROS),
     ),
     **dict.fromkeys(
         (

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import pytest
 
 from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.vectors import IDENTITY
 from tactile_resonance.simulation.cell.transducer import COMMAND_ID, START, CellParameters, LoadCell
 from tactile_resonance.simulation.plant.plant import Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 from tactile_resonance.simulation.plant.tabletop import attach_cell
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.tissue.library import Tissue
-from tactile_resonance.simulation.ur5e.poses import IDENTITY
 
 DT_S, ABOVE_M = 0.002, 2.505e-3
 

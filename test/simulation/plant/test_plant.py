@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.payload import Payload
-from tactile_resonance.contact.vectors import vector
+from tactile_resonance.contact.vectors import transform_from_pose, vector
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.plant import SLIP, Plant
 from tactile_resonance.simulation.plant.surfaces import PlantSurface, relative_radius_m
@@ -24,7 +24,6 @@ from tactile_resonance.simulation.plant.tip import (
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 from tactile_resonance.simulation.tissue.indenter import Indenter
 from tactile_resonance.simulation.tissue.library import Tissue
-from tactile_resonance.simulation.ur5e.poses import transform_from_pose
 
 RADIUS_M, NU = 2.5e-3, 0.49
 ELASTIC = Tissue("elastic", 10e3, (), ())

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from tactile_resonance.contact.vectors import ZEROS
 from tactile_resonance.simulation.cell.transducer import CellParameters, LoadCell, Transducer
 from tactile_resonance.simulation.noise import ROWS, Jitter
 from tactile_resonance.simulation.ur5e.controller import UrController
 from tactile_resonance.simulation.ur5e.forces import ACCURACY, DRIFT_SHARE, PRECISION, FtSensor
 from tactile_resonance.simulation.ur5e.machine import TrackingParameters
-from tactile_resonance.simulation.ur5e.poses import ZERO
 
 SEEDS = (7, [3, 1, 4], np.random.SeedSequence([3, 1, 4]))
 # so many counts that their step is far below the noise; neither bias nor drift
@@ -28,7 +28,7 @@ def steps(controller, count):
 
 
 def readings(transducer, count):
-    return np.array([transducer.convert_once(ZERO)[:6] for _ in range(count)])
+    return np.array([transducer.convert_once(ZEROS)[:6] for _ in range(count)])
 
 
 def assert_variance(samples, variance):
@@ -128,9 +128,9 @@ def test_a_cell_is_reseeded_while_it_streams():
         cell = LoadCell(CELL, construction)
         for command in (b"\x0f\x08", b"\x0b"):
             cell.receive(0x64, command)
-        cell.step(ZERO, 0.0)
-        cell.step(ZERO, 0.01 * construction)
+        cell.step(ZEROS, 0.0)
+        cell.step(ZEROS, 0.01 * construction)
         cell.reseed([8, 9])
-        found.append([frame.data for frame in cell.step(ZERO, 0.01 * construction + 0.05)])
+        found.append([frame.data for frame in cell.step(ZEROS, 0.01 * construction + 0.05)])
     assert len(found[0]) == 100
     assert found[0] == found[1]

@@ -10,13 +10,13 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from tactile_resonance.simulation.ur5e import kinematics
-from tactile_resonance.simulation.ur5e.kinematics import Posture
-from tactile_resonance.simulation.ur5e.poses import (
+from tactile_resonance.contact.vectors import (
     inverse_transform,
     pose_from_transform,
     transform_from_pose,
 )
+from tactile_resonance.simulation.ur5e import kinematics
+from tactile_resonance.simulation.ur5e.kinematics import Posture
 
 sys.path.insert(0, str(Path(__file__).parent))
 from matrices import floats, forward, matrix, matrix_from_pose, transform, turn_between

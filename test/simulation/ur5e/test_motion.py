@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
+from tactile_resonance.contact.vectors import ZEROS, transform_from_pose
 from tactile_resonance.simulation.ur5e import motion
 from tactile_resonance.simulation.ur5e.kinematics import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from tactile_resonance.simulation.ur5e.motion import Trapezoid
-from tactile_resonance.simulation.ur5e.poses import ZERO, transform_from_pose
 from tactile_resonance.simulation.ur5e.target import (
     BRAKE_RAD_S2,
     CYCLE_S,
@@ -221,11 +221,11 @@ def test_two_threads_cannot_move_the_arm_at_once(target):
 
 
 def test_a_speed_of_zero_holds_the_arm_where_it_is_and_takes_its_turn(target):
-    target.hold(ZERO)  # stretched: no other speed of the TCP could be had here
+    target.hold(ZEROS)  # stretched: no other speed of the TCP could be had here
     for _ in range(3):
         target.begin_cycle()
-        next(motion.speedl(target, ZERO, 1.0))
-        assert target.q == ZERO
+        next(motion.speedl(target, ZEROS, 1.0))
+        assert target.q == ZEROS
         with pytest.raises(ScriptError, match="another thread"):
             next(motion.speedj(target, (0.1,) * 6, 1.0))
         target.end_cycle()

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_resonance.simulation.ur5e.kinematics import product
-from tactile_resonance.simulation.ur5e.poses import (
+from tactile_resonance.contact.vectors import (
     inverse_transform,
     pose_from_transform,
     transform_from_pose,
     turn_between,
     turned,
 )
+from tactile_resonance.simulation.ur5e.kinematics import product
 
 sys.path.insert(0, str(Path(__file__).parent))
 import matrices
