@@ -53,7 +53,7 @@ def approach(bench: SimulatedBench, name: str, speed_m_s: float, seed: int) -> A
         tip_radius_m=bench.sensor.tip.radius_m,
         poisson_ratio=library.contact.poisson_ratio,
     )
-    tip = SprungIndenter.on_beam(ball, sensor_modes(bench.sensor))
+    tip = SprungIndenter(ball, sensor_modes(bench.sensor).spring)
     # the touch falls anywhere within a window
     air = round(AIR_S / STEP_S) + int(rng.integers(round(WINDOW_S / STEP_S)))
     after = round(DEEPEST_M / speed_m_s / STEP_S)

@@ -34,7 +34,7 @@ _COMMAND = struct.Struct("<cxxxxxxxqqq7d")
 REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 # Exit statuses of the client process; any other is a death.
-EXIT_ORDERLY, EXIT_BROKEN, EXIT_LINK_LOST = 0, 1, 3
+EXIT_ORDERLY, EXIT_BROKEN = 0, 1
 
 
 class UrCommand(NamedTuple):
@@ -284,7 +284,7 @@ class ClientProcess:
             said = self.last_error()
         # on a lost connection the library reconnects without being asked, prints it, and now and then crashes
         # where a command is under way: the link is why
-        if status == EXIT_LINK_LOST or (status < 0 and LIBRARY_LOST in said):
+        if status < 0 and LIBRARY_LOST in said:
             return ArmError(ArmFault.LINK_LOST, f"the connection to {self._host} is lost")
         return ArmError(
             ArmFault.CLIENT_DIED, f"the client process ended with status {status}: {said}"

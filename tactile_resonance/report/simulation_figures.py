@@ -130,7 +130,7 @@ def _ball(bench: SimulatedBench, tissue: Tissue, work: float = 0.0) -> Indenter:
 
 def _approach(bench: SimulatedBench, tissue: Tissue) -> tuple[FloatArray, FloatArray, FloatArray]:
     ball = _ball(bench, tissue)
-    tip = SprungIndenter.on_beam(ball, sensor_modes(bench.sensor))
+    tip = SprungIndenter(ball, sensor_modes(bench.sensor).spring)
     time = np.arange(0, 0.6, 1e-3)
     rows = []
     for t in time:

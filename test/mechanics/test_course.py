@@ -96,7 +96,7 @@ def test_it_agrees_with_the_bench_over_ramp_hold_and_unloading(name, stiffness_n
     tip, exact = bench, 1e-4
     if np.isfinite(stiffness_n_per_m):  # a light beam that is damped hardly swings
         tip, exact = (
-            SprungIndenter(bench, stiffness_n_per_m=14.8, mass_kg=1e-6, damping_ns_per_m=1e-4),
+            SprungIndenter(bench, (14.8, 1e-4, 1e-6)),
             3e-3,
         )
     tip.step(0.0, 1e-3)

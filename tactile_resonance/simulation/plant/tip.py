@@ -156,8 +156,8 @@ class SprungIndenter:
     Parameters
     ----------
     indenter : Ball
-    stiffness_n_per_m, mass_kg, damping_ns_per_m : float
-        k, m, c.
+    beam : Beam
+        k, c, m, which swings: ``c < 2 sqrt(k m)``.
 
     Attributes
     ----------
@@ -169,38 +169,13 @@ class SprungIndenter:
         first mode is left out.
     """
 
-    def __init__(
-        self,
-        indenter: Ball,
-        *,
-        stiffness_n_per_m: float,
-        mass_kg: float,
-        damping_ns_per_m: float,
-    ) -> None:
-        k, m, c = stiffness_n_per_m, mass_kg, damping_ns_per_m
-        require(0 < k < np.inf, "stiffness_n_per_m", k, "a number above 0")
-        require(0 < m < np.inf, "mass_kg", m, "a number above 0")
-        good = 0 <= c < 2 * sqrt(k * m)
-        require(good, "damping_ns_per_m", c, "0 to below 2 sqrt(stiffness mass)")
-        self.indenter = indenter
-        self._beam = k, c, m
+    def __init__(self, indenter: Ball, beam: Beam) -> None:
+        self.indenter, self._beam = indenter, beam
         # the first step begins at rest, with the beam straight
         self.force_n = 0.0
         self.tip_depth_m = -np.inf
         self._speed = 0.0
         self._base: float | None = None
-
-    @classmethod
-    def on_beam(cls, indenter: Ball, modes: BeamModes) -> SprungIndenter:
-        """Return the tip of a bimorph: ``k = 3 EI / L^3``, frequency and damping of mode 1."""
-        stiffness, natural = modes.static_stiffness_n_per_m, float(modes.natural_rad_s[0])
-        mass = stiffness / natural**2
-        return cls(
-            indenter,
-            stiffness_n_per_m=stiffness,
-            mass_kg=mass,
-            damping_ns_per_m=2 * modes.damping_ratio * natural * mass,
-        )
 
     def step(self, base_depth_m: float, dt_s: float) -> float:
         """Move the base to a depth at constant speed within `dt_s`; return the force there [N]."""
@@ -259,4 +234,4 @@ class Tip:
             adhesion_j_per_m2=self.adhesion_j_per_m2,
         )
         ball: Ball = soft if self.meets is None else self.meets(soft)
-        return RigidTip(ball) if self.beam is None else SprungIndenter.on_beam(ball, self.beam)
+        return RigidTip(ball) if self.beam is None else SprungIndenter(ball, self.beam.spring)

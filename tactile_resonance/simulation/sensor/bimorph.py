@@ -81,6 +81,13 @@ class BeamModes:
         """Stiffness of the whole beam at the tip, ``3 EI / L^3`` [N/m]."""
         return 3 * self.bending_stiffness_nm2 / self.length_m**3
 
+    @property
+    def spring(self) -> tuple[float, float, float]:
+        """Static stiffness [N/m], damping [N s/m] and mass [kg] that swings like mode 1."""
+        stiffness, natural = self.static_stiffness_n_per_m, float(self.natural_rad_s[0])
+        mass = stiffness / natural**2
+        return stiffness, 2 * self.damping_ratio * natural * mass, mass
+
 
 def mass_per_length(beam: BeamParameters) -> float:
     """Return the mass per unit length [kg/m]."""

@@ -272,7 +272,7 @@ def test_what_is_elastic_neither_gives_nor_takes_energy_of_a_ball_on_the_beam(el
         ball = OnSoft(ball, bone(0.0, RADIUS_M))
         plane_pa = BONE_PA / (1 - BONE_POISSON_RATIO**2)
     k, m = 14.8, 2.65e-4
-    tip = SprungIndenter(ball, stiffness_n_per_m=k, mass_kg=m, damping_ns_per_m=0.0)
+    tip = SprungIndenter(ball, (k, 0.0, m))
     base_m, stiffness = -5e-5, 4 / 3 * plane_pa * np.sqrt(RADIUS_M)
     tip.step(base_m - above_m, 0.002)
     energy, hits = [], 0
