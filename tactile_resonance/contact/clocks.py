@@ -17,6 +17,8 @@ import math
 import statistics
 from collections import deque
 
+import numpy as np
+
 from tactile_resonance.fields import require
 
 BLOCK_S = 0.25
@@ -142,20 +144,10 @@ class ClockTracker:
 
 def _lower_edge(points: list[tuple[float, float]]) -> tuple[float, float]:
     """Offset and slope of the edge of the lower convex hull that spans the mean of x."""
-    hull: list[tuple[float, float]] = []
-    for point in points:  # x rises
-        while len(hull) > 1 and _turns_right(hull[-2], hull[-1], point):
-            hull.pop()
-        hull.append(point)
-    middle = sum(x for x, _ in points) / len(points)
-    for left, right in zip(hull, hull[1:], strict=False):
-        if right[0] >= middle:
-            slope = (right[1] - left[1]) / (right[0] - left[0])
-            slope = min(LARGEST_DRIFT, max(-LARGEST_DRIFT, slope))
-            lowest = min(y - slope * x for x, y in points)
-            return lowest, slope
-    return hull[0][1], 0.0
-
-
-def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
+    x, y = np.array(points).T
+    left, right = x < x.mean(), x >= x.mean()
+    # of all lines from a point before the mean to one after it the hull's edge is lowest there
+    slopes = (y[right] - y[left, None]) / (x[right] - x[left, None])
+    heights = y[left, None] + slopes * (x.mean() - x[left, None])
+    slope = float(np.clip(slopes.flat[heights.argmin()], -LARGEST_DRIFT, LARGEST_DRIFT))
+    return float((y - slope * x).min()), slope
