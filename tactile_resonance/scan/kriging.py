@@ -274,13 +274,12 @@ def _fitted(
     most = max(scale, hidden) if noise.all() else hidden
     scatters, first = np.log([hidden, most]), np.log(np.sqrt(hidden * most))
 
-    def cost(x: FloatArray) -> tuple[float, FloatArray]:
-        costs, slopes = zip(*(_cost(x, *part) for part in parts), strict=True)
-        return sum(costs), np.sum(slopes, axis=0)
+    def cost(x: FloatArray) -> float:
+        return sum(_cost(x, *part) for part in parts)
 
     bounds = [lengths, sizes, scatters]
     found = (
-        minimize(cost, np.array([start, size, first]), jac=True, method="L-BFGS-B", bounds=bounds)
+        minimize(cost, np.array([start, size, first]), method="L-BFGS-B", bounds=bounds)
         for start in starts
     )
     return np.exp(min(found, key=lambda each: each.fun).x)
@@ -340,35 +339,21 @@ def _log_likelihoods(
     return np.asarray(-0.5 * (square - cross**2 / known + log_volume))
 
 
-def _cost(
-    x: FloatArray, distances: FloatArray, y: FloatArray, noise: FloatArray
-) -> tuple[float, FloatArray]:
-    """Minus the logarithm of the restricted likelihood, but for a constant, and its (3,) derivatives.
+def _cost(x: FloatArray, distances: FloatArray, y: FloatArray, noise: FloatArray) -> float:
+    """Minus the logarithm of the restricted likelihood, but for a constant.
 
-    By logarithms of length, size and scatter. By a parameter that changes the covariance C by C' they are half
-    the sum of ``G C'`` over all elements, with ``G = C^-1 - w w^T / (1^T w) - a a^T``, ``w = C^-1 1`` and
-    ``a = C^-1 (y - mean)``.
+    At logarithms (3,) of length, size and scatter.
     """
     length, size, scatter = np.exp(x).tolist()
-    scaled = np.sqrt(5) * distances / length
-    decay = size**2 * np.exp(-scaled)
-    process = (1 + scaled + scaled**2 / 3) * decay + np.diag(np.full(len(y), _JITTER * size**2))
-    lower, failed = lapack.dpotrf(process + np.diag(noise**2 + scatter**2), lower=True)
+    alone = noise**2 + scatter**2 + _JITTER * size**2
+    lower, failed = lapack.dpotrf(size**2 * _matern(distances / length) + np.diag(alone), lower=True)
     if failed:
         raise np.linalg.LinAlgError("the covariance of the values is not positive definite")
     solved, _ = lapack.dpotrs(lower, np.stack([np.ones(len(y)), y], axis=1), lower=True)
     weights, known = solved[:, 0], solved[:, 0].sum()
     mean = weights @ y / known
-    gap = solved[:, 1] - mean * weights
     log_volume = 2 * np.sum(np.log(np.diag(lower))) + np.log(known)
-    half = np.tril(lapack.dpotri(lower, lower=True)[0])
-    inverse = half + np.tril(half, -1).T
-    slope = inverse - np.outer(weights, weights) / known - np.outer(gap, gap)
-    by_length = np.sum(slope * scaled**2 * (1 + scaled) / 3 * decay)
-    by_size = 2 * np.sum(slope * process)
-    by_scatter = 2 * scatter**2 * np.trace(slope)
-    cost = 0.5 * ((y - mean) @ gap + log_volume)
-    return float(cost), np.array([by_length, by_size, by_scatter]) / 2
+    return 0.5 * float((y - mean) @ (solved[:, 1] - mean * weights) + log_volume)
 
 
 def _solved(lower: FloatArray, right: FloatArray) -> FloatArray:
