@@ -73,8 +73,7 @@ def course_of(
     time = _own(time_s)
     depth = _own(np.broadcast_to(depth_m, (einf.size, time.size)))
     force, delta = np.zeros_like(depth), np.zeros_like(depth)
-    k = ball.stiffness_n_per_m
-    bending = 1 / k if np.isfinite(k) else 0.0
+    bending = 1 / ball.stiffness_n_per_m  # 0 of a ball that is held rigidly
     _press(ball.factor, bending, time, depth, turn, einf, moduli, times, force, delta)
     return force, delta
 
@@ -243,8 +242,7 @@ class SeriesProblem:
         self.ball, self.means, self._test = test.ball, means, test
         self._time, self._depth, self._at = _nodes(means)
         c, most, peak = self.ball.factor, self._depth.max(), means.force_n.max()
-        if np.isfinite(self.ball.stiffness_n_per_m):
-            most = max(0.05 * most, most - peak / self.ball.stiffness_n_per_m)
+        most = max(0.05 * most, most - peak / self.ball.stiffness_n_per_m)
         self._scale_pa = peak / (c * most**1.5)
         self._small_pa = 1e-2 * self._scale_pa
         self._tried_s = means.ramp_s / 15, 2 * means.hold_s
