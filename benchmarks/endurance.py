@@ -22,6 +22,7 @@ import numpy as np
 
 from benchmarks.skip_hands import VirtualHands
 from tactile_resonance.commands.report import report_run
+from tactile_resonance.configuration import dump_yaml
 from tactile_resonance.scan.hands import Controls
 from tactile_resonance.scan.map_messages import cloud_message, marker_message, surface_message
 from tactile_resonance.scan.messages import header_message, message_types, to_cdr
@@ -42,7 +43,6 @@ from tactile_resonance.scan.runner import ScanRunner
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
-from tactile_resonance.strict_yaml import dump_yaml
 
 POINTS, PARTS, QUICK = 10_000, 10, 100
 FILLED = (

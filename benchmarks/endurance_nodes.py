@@ -23,13 +23,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.load_case import MOST_DEVIATIONS, busy_loop, descendants
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import dump_yaml, parse_yaml, share_path
 from tactile_resonance.files import write_whole
 from tactile_resonance.processes import end_with_parent, free_domain_id
 from tactile_resonance.report.point_details import deviations, truths_of
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.run_content import RunContent, read_run
-from tactile_resonance.strict_yaml import dump_yaml, parse_yaml
 
 HOST = "127.0.83.1"
 ROBOT_TITLE = "A long scan with the robot, in simulated time"

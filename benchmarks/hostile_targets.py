@@ -26,7 +26,7 @@ from tactile_resonance.calibration.model import (
 )
 from tactile_resonance.commands.analyze import parse_harmonics, parse_order, parse_segments
 from tactile_resonance.commands.mechanics import COLUMNS
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import parse_yaml, share_path
 from tactile_resonance.contact.parameters import read_contact
 from tactile_resonance.drivers.can_frames import read_can_description
 from tactile_resonance.drivers.force_config import read_force_config
@@ -50,7 +50,6 @@ from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.cell.transducer import CellParameters
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
-from tactile_resonance.strict_yaml import parse_yaml
 from tactile_resonance.tissue.references import read_classes, read_sources
 
 Read = Callable[[bytes], object]

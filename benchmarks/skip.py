@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 
 from benchmarks import skip_decision, skip_time, skip_touches
 from benchmarks.skip_hands import Scanned, scan
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import parse_yaml, share_path
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 from tactile_resonance.scan.adaptive import Adaptive, known_points
 from tactile_resonance.scan.level_set import LevelSet, difference_m2
-from tactile_resonance.strict_yaml import parse_yaml
 
 Content = Mapping[str, Any]
 FINE_M = 0.002

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tactile_resonance.configuration import dump_yaml
 from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.frf.measurement import MeasurementFrf
@@ -32,7 +33,6 @@ from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import PhantomScene, read_scene
-from tactile_resonance.strict_yaml import dump_yaml
 
 FORCE_STD_N = 1.5e-4
 AGE_S = 1.0

@@ -16,9 +16,9 @@ from typing import Any
 import yaml
 
 from tactile_resonance.clock import PORT as TIME_PORT
+from tactile_resonance.configuration import parse_yaml
 from tactile_resonance.fields import cut, numbers, read_text, require
 from tactile_resonance.simulation.plant.defaults import HOST, STALLS_S, TABLE_IN_BASE
-from tactile_resonance.strict_yaml import parse_yaml
 
 NODES = (
     "fake_hardware_node",

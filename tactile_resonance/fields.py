@@ -34,7 +34,7 @@ from typing import (
     get_type_hints,
 )
 
-from tactile_resonance.strict_yaml import parse_yaml
+from tactile_resonance.configuration import parse_yaml
 
 T = TypeVar("T")
 

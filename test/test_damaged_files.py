@@ -9,11 +9,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.hostile_targets import CONFIGURATION
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import dump_yaml, parse_yaml, share_path
 from tactile_resonance.fields import LONGEST
 from tactile_resonance.simulation.tissue.library import read_tissues
 from tactile_resonance.simulation.tissue.scene import read_scene
-from tactile_resonance.strict_yaml import dump_yaml, parse_yaml
 
 LIBRARY = read_tissues()
 READERS = {**CONFIGURATION, "./scenes/*.yaml": lambda path: read_scene(LIBRARY, path)}

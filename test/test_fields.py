@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.configuration import MOST_ALIASES, MOST_DEPTH, dump_yaml, parse_yaml
 from tactile_resonance.fields import (
     LONGEST,
     MOST_BYTES,
@@ -29,7 +30,6 @@ from tactile_resonance.fields import (
     read_yaml,
     require,
 )
-from tactile_resonance.strict_yaml import MOST_ALIASES, MOST_DEPTH, dump_yaml, parse_yaml
 
 
 class Colour(Enum):

@@ -10,7 +10,7 @@ from tactile_resonance import cli
 PACKAGE = Path(cli.__file__).parent
 TOOLS = {
     *("_typing", "clock", "configuration", "fields", "files", "processes"),
-    *("array_files", "strict_yaml"),
+    "array_files",
 }
 CORE = {
     *("calibration", "contact", "frf", "mechanics", "poles", "tissue"),

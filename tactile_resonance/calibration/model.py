@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray
+from tactile_resonance.configuration import dump_yaml
 from tactile_resonance.fields import (
     AboveZero,
     Checked,
@@ -39,7 +40,6 @@ from tactile_resonance.fields import (
     read_yaml,
     require,
 )
-from tactile_resonance.strict_yaml import dump_yaml
 
 PER_MODE = ("natural_rad_s", "damping_ratio", "coupling_rad_s", "tip_deflection")
 SINGLE = ("feedthrough", "leak_rad_s", "gain", "delay_s")

@@ -20,10 +20,10 @@ from tactile_resonance.commands.bench_scan import (
     take_domain,
 )
 from tactile_resonance.commands.options import add_option, require_packages
+from tactile_resonance.configuration import parse_yaml
 from tactile_resonance.fields import read
 from tactile_resonance.processes import NodeProcesses, noting_signals
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
-from tactile_resonance.strict_yaml import parse_yaml
 
 if TYPE_CHECKING:
     from tactile_resonance.client import CalibrationOutcome

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from tactile_resonance.configuration import parse_yaml
 from tactile_resonance.fields import counted
 from tactile_resonance.report import run_tables as tables
 from tactile_resonance.report.drawing import SIMULATED
@@ -34,7 +35,6 @@ from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.run_content import RunContent, not_checked
 from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
 from tactile_resonance.scan.tissue_tests import TYPE as TEST_TYPE
-from tactile_resonance.strict_yaml import parse_yaml
 from tactile_resonance.tissue.classify import UNKNOWN
 from tactile_resonance.tones import SilentRecord, silent_record
 

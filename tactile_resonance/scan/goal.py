@@ -15,14 +15,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import dump_yaml, share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import number, read_yaml, require
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.points import require_near, scan_points
 from tactile_resonance.scan.scene import ScanScene, parse_notes, parse_scan_scene
 from tactile_resonance.scan.surface import with_file_beside
-from tactile_resonance.strict_yaml import dump_yaml
 from tactile_resonance.tissue.references import with_library
 
 

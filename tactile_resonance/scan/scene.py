@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, cast
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import parse_yaml, share_path
 from tactile_resonance.contact.goal import HoldMode
 from tactile_resonance.fields import (
     AboveZero,
@@ -37,7 +37,6 @@ from tactile_resonance.scan.decision import BlockLimits, Gate, Precise, Separate
 from tactile_resonance.scan.points import flat, read_positions, require_near
 from tactile_resonance.scan.surface import NormalRequest, Plane, Surface, TouchRequest, read_surface
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
-from tactile_resonance.strict_yaml import parse_yaml
 from tactile_resonance.tissue.classify import TissueClass
 from tactile_resonance.tissue.nominal_contact import NominalContact
 from tactile_resonance.tissue.references import parse_classes, parse_nominal_contact, with_library

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.configuration import dump_yaml
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import (
     AboveZero,
@@ -40,7 +41,6 @@ from tactile_resonance.scan.surface_search import (
     fit_surface,
     fit_touches,
 )
-from tactile_resonance.strict_yaml import dump_yaml
 
 MOST_TILT_STD_RAD = 5e-3
 """Standard deviation of the tilt about any axis; beyond it the points lie too close together or to one line."""

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
+from tactile_resonance.configuration import dump_yaml
 from tactile_resonance.fields import (
     AboveZero,
     BelowOne,
@@ -28,7 +29,6 @@ from tactile_resonance.fields import (
     read_yaml,
     require,
 )
-from tactile_resonance.strict_yaml import dump_yaml
 from tactile_resonance.tissue.classify import TissueClass, class_from_samples, predictive_class
 from tactile_resonance.tissue.nominal_contact import (
     ForceSensitivity,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_resonance.configuration import share_path
+from tactile_resonance.configuration import parse_yaml, share_path
 from tactile_resonance.contact.force_spread import spread_of
 from tactile_resonance.multisine import Grid
 from tactile_resonance.poles.structure import PoleBand
@@ -33,7 +33,6 @@ from tactile_resonance.scan.scene import (
     read_scan_scene,
     residual_terms_of,
 )
-from tactile_resonance.strict_yaml import parse_yaml
 
 SCENE = share_path("config/scenes/two_gelatines.yaml")
 
