@@ -388,12 +388,9 @@ class ContactNode(ManagedNode):
     def _on_poles(self, message: msg.Poles) -> None:
         thread = self._thread
         now_ns = thread.clock.ros_ns(thread.clock.now_ns())
-        try:
-            touched = self._touch.hear(message, thread.controller.state, now_ns)
-            if touched and thread.tell_touch():
-                self.get_logger().info("the resonance detects the first contact")
-        except ValueError as error:
-            self.health.error(f"poles: {error}")
+        touched = self._touch.hear(message, thread.controller.state, now_ns)
+        if touched and thread.tell_touch():
+            self.get_logger().info("the resonance detects the first contact")
 
     # each cycle, in the loop's thread
 

@@ -51,11 +51,7 @@ class FrfNode(ManagedNode):
         self.listen(msg.Record, "record", self._on_record, RESULTS)
 
     def _on_excitation(self, message: msg.Excitation) -> None:
-        try:
-            excitation = excitation_from_message(message)
-        except ValueError as error:
-            self.health.error(f"excitation {message.excitation_id}: {error}")
-            return
+        excitation = excitation_from_message(message)
         # records of the measurement before may still be queued: forget the oldest only
         self._excitations.pop(excitation.excitation_id, None)
         self._excitations[excitation.excitation_id] = excitation
@@ -67,12 +63,7 @@ class FrfNode(ManagedNode):
             self._take(record)
 
     def _on_record(self, message: msg.Record) -> None:
-        try:
-            record = record_from_message(message)
-        except ValueError as error:
-            self.health.error(f"record of excitation {message.excitation_id}: {error}")
-            return
-        self._take(record)
+        self._take(record_from_message(message))
 
     def _take(self, record: Record) -> None:
         """Publish an FRF, or why there is none: a reader waits for an answer to every record."""

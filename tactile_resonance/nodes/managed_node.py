@@ -148,12 +148,18 @@ class ManagedNode(LifecycleNode):
         raw: bool = False,
         always: bool = False,
     ) -> None:
-        """Subscription until the node is cleaned up, heard while active or `always`; serialised if `raw`."""
+        """Subscription until the node is cleaned up, heard while active or `always`; serialised if `raw`.
+
+        A message at which the callback raises ``ValueError`` is reported, and left out.
+        """
 
         def heard(message: Any) -> None:
             if self.active or always:
                 begun_s = time.perf_counter()
-                callback(message)
+                try:
+                    callback(message)
+                except ValueError as error:
+                    self.health.error(f"{topic}: {error}")
                 self.health.saw(topic, time.perf_counter() - begun_s)
 
         subscription = self.create_subscription(kind, topic, heard, qos, raw=raw)

@@ -38,6 +38,12 @@ def node(monkeypatch):
         node.destroy_node()
 
 
+def hear(node, topic, message):
+    """As it arrives."""
+    (heard,) = (each for each in node.subscriptions if each.topic_name == f"/{topic}")
+    heard.callback(message)
+
+
 def excitation(key):
     return design_multisine(
         sample_rate_hz=RATE_HZ,
@@ -75,11 +81,11 @@ def finals(node):
 
 def test_records_queued_behind_the_next_excitation_are_not_lost(node):
     (first, first_records), (second, second_records) = messages(1), messages(2)
-    node._on_excitation(first)
-    node._on_record(first_records[0])
-    node._on_excitation(second)
+    hear(node, "excitation", first)
+    hear(node, "record", first_records[0])
+    hear(node, "excitation", second)
     for record in first_records[1:] + second_records:
-        node._on_record(record)
+        hear(node, "record", record)
     assert len(node.published) == 2 * PERIODS
     for key, frf in finals(node).items():
         np.testing.assert_allclose(frf.g, 0.1 * key, rtol=1e-9)
@@ -89,37 +95,38 @@ def test_records_queued_behind_the_next_excitation_are_not_lost(node):
 def test_records_may_come_before_their_excitation(node):
     message, records = messages(3)
     for record in records:
-        node._on_record(record)
+        hear(node, "record", record)
     assert node.published == []
-    node._on_excitation(message)
+    hear(node, "excitation", message)
     assert [m.final for m in node.published] == [False, False, True]
 
 
 def test_a_measurement_replayed_twice_starts_anew(node):
     message, records = messages(4)
     for _ in range(2):
-        node._on_excitation(message)
+        hear(node, "excitation", message)
         for record in records:
-            node._on_record(record)
+            hear(node, "record", record)
     assert [m.periods for m in node.published] == [1, 2, 3, 1, 2, 3]
     assert not any("lost" in m.message for m in node.published)
 
 
 def test_what_does_not_fit_is_refused_and_the_next_is_taken(node):
     message, records = messages(5)
-    node._on_excitation(message)
-    node._on_record(records[0])
+    hear(node, "excitation", message)
+    hear(node, "record", records[0])
     records[1].sensor_v.append(0.0)
-    node._on_record(records[1])
+    hear(node, "record", records[1])
     broken = excitation_to_message(excitation(6), 0, "tip")
     broken.phase_rad.append(1.0)
-    node._on_excitation(broken)
+    hear(node, "excitation", broken)
+    assert node.health._error.startswith("excitation: ")
     assert [m.status for m in node.published] == [1, 3]  # no covariance yet; failed
     assert "200 and 201 samples" in node.published[1].message
     message, records = messages(7)
-    node._on_excitation(message)
+    hear(node, "excitation", message)
     for record in records:
-        node._on_record(record)
+        hear(node, "record", record)
     assert 7 in finals(node)
 
 
@@ -127,20 +134,21 @@ def test_what_does_not_fit_is_refused_and_the_next_is_taken(node):
 def test_a_record_without_a_sample_rate_does_no_harm(node, rate_hz):
     message, records = messages(8)
     records[0].sample_rate_hz = rate_hz
-    node._on_excitation(message)
-    node._on_record(records[0])
+    hear(node, "excitation", message)
+    hear(node, "record", records[0])
     assert node.published == []
+    assert node.health._error.startswith("record: sample_rate_hz: ")
     records[0].sample_rate_hz = RATE_HZ
     for record in records:
-        node._on_record(record)
+        hear(node, "record", record)
     assert 8 in finals(node)
 
 
 def test_a_record_that_does_not_fit_may_come_before_its_excitation(node):
     message, records = messages(9)
     records[0].sensor_v.append(0.0)
-    node._on_record(records[0])
-    node._on_excitation(message)
+    hear(node, "record", records[0])
+    hear(node, "excitation", message)
     assert [m.status for m in node.published] == [3]
 
 
@@ -150,12 +158,12 @@ def test_an_estimate_that_raises_gets_a_failure_with_its_reason(node, monkeypatc
 
     _, records = messages(10)
     bands = (PoleBand(60.0, 90.0), PoleBand(120.0, 160.0))
-    node._on_excitation(excitation_to_message(replace(excitation(10), bands=bands), 0, "tip"))
+    hear(node, "excitation", excitation_to_message(replace(excitation(10), bands=bands), 0, "tip"))
     with monkeypatch.context() as patched:
         patched.setattr("tactile_resonance.frf.measurement.MeasurementFrf.add", broken)
-        node._on_record(records[0])
-    node._on_excitation(messages(11)[0])
-    node._on_record(messages(11)[1][0])
+        hear(node, "record", records[0])
+    hear(node, "excitation", messages(11)[0])
+    hear(node, "record", messages(11)[1][0])
     assert [m.status for m in node.published] == [3, 1]
     assert node.published[0].message == "ZeroDivisionError: division by zero"
     # so that each band has poles that say so
