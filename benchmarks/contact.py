@@ -29,7 +29,7 @@ from benchmarks.contact_case import (
 )
 from benchmarks.contact_drivers import DriversResult
 from benchmarks.contact_laws import LAWS, run_law
-from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.payload import Mount
 from tactile_resonance.report.drawing import SIMULATED, new_figure, save_figure
 
 RADII_M = (1.5e-3, 2.25e-3, 3e-3)

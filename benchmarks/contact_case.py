@@ -10,10 +10,10 @@ import numpy as np
 
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
-from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.payload import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.cell.transducer import CellParameters

@@ -10,8 +10,6 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from tactile_resonance.contact.force_spread import ForceSpread
-
 SIMULATED = "simulated, not measured"
 """How pages, figures and notes say it."""
 
@@ -59,6 +57,25 @@ class Channel:
         if self.is_counts:
             return self.samples * self.scale_v + self.offset_v
         return cast("npt.NDArray[np.floating]", self.samples)
+
+
+@dataclass(frozen=True)
+class ForceSpread:
+    """How a force moved over an interval; NaN where not known.
+
+    Attributes
+    ----------
+    rms_n : float
+        Root mean square about the mean [N], the sensor's noise taken off, and with it what is as quick: 3 %
+        of a motion of 5 Hz, 12 % of one of 10 Hz. 0: noise explains all of it. Noise of 1 mN at 1 kHz
+        leaves an uncertainty of about 0.1 mN after 0.4 s where the force does not move.
+    min_n, max_n : float
+        Smallest and largest mean over 20 ms [N], with their noise.
+    """
+
+    rms_n: float = float("nan")
+    min_n: float = float("nan")
+    max_n: float = float("nan")
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ def _plant(options: argparse.Namespace) -> Plant:
     """Tissue and load cell as the options want them."""
     import numpy as np
 
-    from tactile_resonance.contact.interfaces import Mount
+    from tactile_resonance.contact.payload import Mount
     from tactile_resonance.contact.samples import Pose
     from tactile_resonance.sensor import read_sensor
     from tactile_resonance.simulation.plant.surfaces import LaidScene

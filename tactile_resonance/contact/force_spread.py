@@ -19,10 +19,9 @@ import threading
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import islice
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +30,7 @@ from tactile_resonance._typing import FloatArray, IntArray
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, vector
 from tactile_resonance.fields import require
-
-if TYPE_CHECKING:
-    from tactile_resonance.record import Contact
+from tactile_resonance.record import Contact, ForceSpread
 
 SHORT_S = 0.02
 """Of the short means [s]."""
@@ -46,25 +43,6 @@ SHORTEST_S = LEAST_SHORT * SHORT_S
 
 LEAST_KNOWN = 0.8
 """Of the blocks of a measurement, in time, whose spread must be known."""
-
-
-@dataclass(frozen=True)
-class ForceSpread:
-    """How a force moved over an interval; NaN where not known.
-
-    Attributes
-    ----------
-    rms_n : float
-        Root mean square about the mean [N], the sensor's noise taken off, and with it what is as quick: 3 %
-        of a motion of 5 Hz, 12 % of one of 10 Hz. 0: noise explains all of it. Noise of 1 mN at 1 kHz
-        leaves an uncertainty of about 0.1 mN after 0.4 s where the force does not move.
-    min_n, max_n : float
-        Smallest and largest mean over 20 ms [N], with their noise.
-    """
-
-    rms_n: float = math.nan
-    min_n: float = math.nan
-    max_n: float = math.nan
 
 
 def spread_of(
@@ -246,8 +224,6 @@ class ForceRecord:
         ValueError
             If it does not end after it begins.
         """
-        from tactile_resonance.record import Contact  # it needs the spread
-
         require(t0_ns < t1_ns, "t1_ns", t1_ns, f"above t0_ns = {t0_ns}")
         with self._lock:
             now_ns, zero_std_n = self._now_ns, self._zero_std_n

@@ -12,15 +12,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import Annotated, Protocol
 
 from tactile_resonance.clock import Clock
+from tactile_resonance.contact.payload import Mounting
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import Six, six
 from tactile_resonance.fields import Checked, Range
-
-if TYPE_CHECKING:  # it needs the kinds of mounts
-    from tactile_resonance.contact.payload import Mounting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,13 +58,6 @@ def check_acceleration(value: float, limits: CommandLimits) -> None:
             f"acceleration: {value:g}, the configuration allows above 0 to "
             f"{limits.max_acceleration_m_s2:g}"
         )
-
-
-class Mount(str, Enum):
-    """Where the force sensor sits."""
-
-    TOOL = "tool"
-    TABLE = "table"
 
 
 class ForceFault(str, Enum):

@@ -16,8 +16,9 @@ from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.free_motion import STILL_M_S, STILL_RAD_S
 from tactile_resonance.contact.geometry import TipPath
 from tactile_resonance.contact.goal import TOUCHING, Command, ContactGoal, ContactResult, State
-from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, Cell, ForceError, Mount
+from tactile_resonance.contact.interfaces import Arm, ArmError, ArmFault, Cell, ForceError
 from tactile_resonance.contact.machine import ContactController
+from tactile_resonance.contact.payload import Mount
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import Vector, turn_from_vector
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol

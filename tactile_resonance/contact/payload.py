@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.interfaces import Mount
 from tactile_resonance.contact.samples import CellSample, Pose, WrenchSample
 from tactile_resonance.contact.vectors import (
     NO_TURN,
@@ -183,6 +183,13 @@ def identify_payload(
         chi_square=float(residual @ residual),
         dof=6 * n - 10,
     )
+
+
+class Mount(str, Enum):
+    """Where the force sensor sits."""
+
+    TOOL = "tool"
+    TABLE = "table"
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,9 @@ from tactile_resonance.contact.interfaces import (
     ForceError,
     ForceFault,
     ForceInfo,
-    Mount,
     NodeArm,
 )
-from tactile_resonance.contact.payload import Mounting
+from tactile_resonance.contact.payload import Mount, Mounting
 from tactile_resonance.contact.samples import ArmSample, CellSample
 from tactile_resonance.contact.vectors import Six, rotated_back, turn_from_vector
 from tactile_resonance.drivers.can_frames import CanDescription, read_can_description

@@ -11,10 +11,11 @@ from collections.abc import Callable
 from tactile_resonance.clock import Clock
 from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.goal import ContactGoal, State
-from tactile_resonance.contact.interfaces import Cell, ForceError, Mount, NodeArm
+from tactile_resonance.contact.interfaces import Cell, ForceError, NodeArm
 from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import IDLE_PERIODS, ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
+from tactile_resonance.contact.payload import Mount
 
 # A tip that cannot be drawn back in this time is left where the envelope stopped it.
 RETRACT_WITHIN_S = 12.0

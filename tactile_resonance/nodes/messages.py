@@ -17,7 +17,6 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
-from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
@@ -25,7 +24,7 @@ from tactile_resonance.frf.result import FRF, PER_LINE, BandBins, BandDistortion
 from tactile_resonance.multisine import Excitation
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.poles.structure import PoleBand
-from tactile_resonance.record import Contact, Origin, Record
+from tactile_resonance.record import Contact, ForceSpread, Origin, Record
 from tactile_resonance.recording.messages import (
     BETWEEN_SAMPLES,
     EXCITATION,

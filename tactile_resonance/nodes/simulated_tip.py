@@ -24,7 +24,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from tactile_resonance import msg
-from tactile_resonance.contact.force_spread import ForceSpread, joined_spread
+from tactile_resonance.contact.force_spread import joined_spread
 from tactile_resonance.contact.vectors import Vector, vector
 from tactile_resonance.nodes.managed_node import ManagedNode
 from tactile_resonance.nodes.messages import (
@@ -37,7 +37,7 @@ from tactile_resonance.nodes.parameters import pose_of, values
 from tactile_resonance.nodes.running import PLACES, STREAM, TRUTHS
 from tactile_resonance.poles.result import Poles, PolesStatus
 from tactile_resonance.processes import may_take_priority, start_child
-from tactile_resonance.record import Contact, Origin
+from tactile_resonance.record import Contact, ForceSpread, Origin
 from tactile_resonance.recording.messages import (
     contact_from_message,
     fill,

@@ -20,13 +20,20 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray
-from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.frf.result import BandDistortion
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol
 from tactile_resonance.multisine import Excitation, Grid
 from tactile_resonance.poles.result import STATUS_CODE, Poles, PolesStatus
 from tactile_resonance.poles.structure import ModelStructure, PoleBand
-from tactile_resonance.record import BetweenSamples, Channel, Contact, InputKind, Origin, Record
+from tactile_resonance.record import (
+    BetweenSamples,
+    Channel,
+    Contact,
+    ForceSpread,
+    InputKind,
+    Origin,
+    Record,
+)
 from tactile_resonance.recording.recording import MAX_RATE_HZ, MIN_RATE_HZ
 
 # The constants of the messages.

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
-from tactile_resonance.contact.interfaces import ArmFault, ForceFault, Mount
+from tactile_resonance.contact.interfaces import ArmFault, ForceFault
 from tactile_resonance.contact.parameters import ContactParameters
+from tactile_resonance.contact.payload import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
 

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.contact.payload import Mounting, Payload, identify_payload
+from tactile_resonance.contact.payload import Mount, Mounting, Payload, identify_payload
 from tactile_resonance.contact.samples import CellSample, Pose
 from tactile_resonance.contact.vectors import NO_TURN, ZERO, six, vector
 

@@ -9,14 +9,10 @@ import pytest
 from scipy.signal import lfilter
 
 from tactile_resonance.contact import force_spread
-from tactile_resonance.contact.force_spread import (
-    ForceRecord,
-    ForceSpread,
-    joined_spread,
-    spread_of,
-)
+from tactile_resonance.contact.force_spread import ForceRecord, joined_spread, spread_of
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
 from tactile_resonance.contact.vectors import turn_from_quaternion, vector_from_turn
+from tactile_resonance.record import ForceSpread
 
 NOISE_N = 1e-3
 

@@ -11,7 +11,8 @@ import pytest
 import yaml
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.interfaces import ArmError, ArmFault, ForceError, ForceFault, Mount
+from tactile_resonance.contact.interfaces import ArmError, ArmFault, ForceError, ForceFault
+from tactile_resonance.contact.payload import Mount
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import six
 from tactile_resonance.drivers.force_config import RtdeWrench, force_source, read_force_config

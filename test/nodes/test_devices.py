@@ -26,7 +26,6 @@ from tactile_resonance.action import Measure
 from tactile_resonance.srv import ForceOver
 
 from tactile_resonance.configuration import share_path
-from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.drivers.acquisition import DeviceError, DeviceInfo
 from tactile_resonance.nodes import devices, excitation_node
 from tactile_resonance.nodes.devices import FORCE_WITHIN_S
@@ -36,7 +35,7 @@ from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.parameters import declare
 from tactile_resonance.nodes.running import PLACES, initialised
 from tactile_resonance.processes import free_domain_id
-from tactile_resonance.record import Channel, Contact, Origin, Record
+from tactile_resonance.record import Channel, Contact, ForceSpread, Origin, Record
 from tactile_resonance.recording.messages import record_from_message, time_from_message
 from tactile_resonance.recording.store import read_stored
 

@@ -13,7 +13,6 @@ rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not here")
 serialization = pytest.importorskip("rclpy.serialization")
 msg = pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
-from tactile_resonance.contact.force_spread import ForceSpread  # noqa: E402
 from tactile_resonance.frf.result import (  # noqa: E402
     FRF,
     BandBins,
@@ -29,6 +28,7 @@ from tactile_resonance.record import (  # noqa: E402
     BetweenSamples,
     Channel,
     Contact,
+    ForceSpread,
     InputKind,
     Origin,
     Record,

@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.multisine import design_multisine
 from tactile_resonance.record import (
     BetweenSamples,
     Channel,
     Contact,
+    ForceSpread,
     InputKind,
     Origin,
     Record,

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.poles.result import Poles
-from tactile_resonance.record import Contact, Origin
+from tactile_resonance.record import Contact, ForceSpread, Origin
 from tactile_resonance.recording.messages import write_indentation
 from tactile_resonance.scan.decision import BlockLimits, Precise
 from tactile_resonance.scan.hands import Controls, Measured, PointFailed

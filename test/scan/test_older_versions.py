@@ -12,8 +12,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.multisine import design_multisine
+from tactile_resonance.record import ForceSpread
 from tactile_resonance.scan.messages import make_message, message_types
 from tactile_resonance.scan.point_result import TYPE as RESULT
 from tactile_resonance.scan.point_result import serialised

@@ -11,9 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from tactile_resonance.contact.force_spread import ForceSpread
 from tactile_resonance.poles.result import Poles, PolesStatus
-from tactile_resonance.record import Contact, Origin
+from tactile_resonance.record import Contact, ForceSpread, Origin
 from tactile_resonance.recording.messages import POLES_STATUS
 from tactile_resonance.scan.decision import Decision, Verdict
 from tactile_resonance.scan.hands import Measured

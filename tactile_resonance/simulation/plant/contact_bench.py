@@ -26,12 +26,11 @@ from tactile_resonance.contact.interfaces import (
     ForceError,
     ForceFault,
     ForceInfo,
-    Mount,
 )
 from tactile_resonance.contact.loop import ContactLoop, IndentationRecorder
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
-from tactile_resonance.contact.payload import Mounting, Payload
+from tactile_resonance.contact.payload import Mount, Mounting, Payload
 from tactile_resonance.contact.samples import ArmSample, CellSample, Pose
 from tactile_resonance.contact.vectors import nearer, six, transform_from_pose, vector
 from tactile_resonance.mechanics.indentation import BallTip, IndentationRecord, Protocol

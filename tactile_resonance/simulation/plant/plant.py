@@ -15,8 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.contact.payload import GRAVITY_M_S2, Payload
+from tactile_resonance.contact.payload import GRAVITY_M_S2, Mount, Payload
 from tactile_resonance.contact.vectors import (
     IDENTITY,
     ZERO,

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
-from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.payload import Mount
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Six, Vector
 from tactile_resonance.fields import number, read_dataclass, require

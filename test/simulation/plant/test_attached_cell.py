@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tactile_resonance.contact.interfaces import Mount
+from tactile_resonance.contact.payload import Mount
 from tactile_resonance.contact.vectors import IDENTITY
 from tactile_resonance.simulation.cell.transducer import COMMAND_ID, START, CellParameters, LoadCell
 from tactile_resonance.simulation.plant.plant import Plant

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tactile_resonance.contact.interfaces import Mount
-from tactile_resonance.contact.payload import Payload
+from tactile_resonance.contact.payload import Mount, Payload
 from tactile_resonance.contact.vectors import transform_from_pose, vector
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.plant import SLIP, Plant
