@@ -97,6 +97,17 @@ class TipGeometry(Checked):
         turn = turn_from_vector((0.0, -off_rad, 0.0))
         return self.housing_height(turn, (0.0, 0.0, 1.0), -depth_m)
 
+    def check_clear(self, limits: Limits) -> None:
+        """Raise ``ValueError`` unless the housing stays clear wherever the limits allow the tip to be."""
+        height = self.worst_height(limits.depth_m, limits.misalignment_rad)
+        if height < limits.clearance_m:
+            raise ValueError(
+                f"depth_m: at {1e3 * limits.depth_m:g} mm, the tip off by misalignment_rad = "
+                f"{limits.misalignment_rad:g}, the housing is {1e3 * height:.2f} mm above the surface; "
+                f"accepted is clearance_m = {1e3 * limits.clearance_m:g} mm or more: less depth, or a "
+                "larger beam_tilt_rad"
+            )
+
 
 def touch_pose(
     point_m: ArrayLike, normal: ArrayLike, towards: ArrayLike, ball_radius_m: float

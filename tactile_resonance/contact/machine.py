@@ -26,14 +26,13 @@ from tactile_resonance.contact.goal import (
     ContactGoal,
     ContactResult,
     HoldMode,
-    Memory,
     Move,
     NotIdleError,
-    Outcome,
     State,
 )
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.contact.observer import Observer
+from tactile_resonance.contact.outcome import Memory, Outcome
 from tactile_resonance.contact.parameters import ContactParameters, Limits, check_goal
 from tactile_resonance.contact.pressing import Pressing, TissueMotion
 from tactile_resonance.contact.samples import ArmSample, WrenchSample
@@ -204,7 +203,9 @@ class ContactController:
             p = replace(p, carried_kg=0.0)
         limits = self.limits
         limits.check(p)
-        check_goal(goal, p, limits, self._tip)
+        check_goal(goal, p, limits)
+        if self._tip is not None:
+            self._tip.check_clear(limits)
         observer = Observer(p, limits)
         path = TipPath(goal, self._tip)
         known = self._memory.knows(goal, p.known_radius_m)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.vectors import rotated
 from tactile_resonance.fields import build, read_file, require
-
-if TYPE_CHECKING:  # it needs the limits
-    from tactile_resonance.contact.geometry import TipGeometry
 
 
 def within(default: float, low: float, high: float, description: str) -> Any:
@@ -309,23 +306,8 @@ FORCE_SHARE = 2 / 3
 """Of the abort force that may be asked for."""
 
 
-def check_goal(
-    goal: ContactGoal,
-    parameters: ContactParameters,
-    limits: Limits,
-    tip: TipGeometry | None = None,
-) -> None:
-    """Raise ``ValueError`` where a goal lies beyond the limits.
-
-    Parameters
-    ----------
-    goal : ContactGoal
-    parameters : ContactParameters
-    limits : Limits
-    tip : TipGeometry, optional
-        Its housing must stay clear of the surface as deep as the limits allow, the tip as far off its
-        orientation as they allow.
-    """
+def check_goal(goal: ContactGoal, parameters: ContactParameters, limits: Limits) -> None:
+    """Raise ``ValueError`` where a goal lies beyond the limits."""
     good = bool(np.isfinite(goal.touch.vector).all())
     require(good, "touch", goal.touch.vector.tolist(), "six finite numbers")
     most = FORCE_SHARE * limits.abort_force_n
@@ -350,15 +332,6 @@ def check_goal(
             raise ValueError(f"touch: its {name} {place} lies outside the workspace {ends}")
     if normal[2] < math.cos(limits.tilt_rad):
         raise ValueError(f"touch: tilted by more than tilt_rad = {limits.tilt_rad}")
-    if tip is not None:
-        height = tip.worst_height(limits.depth_m, limits.misalignment_rad)
-        if height < limits.clearance_m:
-            raise ValueError(
-                f"depth_m: at {1e3 * limits.depth_m:g} mm, the tip off by misalignment_rad = "
-                f"{limits.misalignment_rad:g}, the housing is {1e3 * height:.2f} mm above the surface; "
-                f"accepted is clearance_m = {1e3 * limits.clearance_m:g} mm or more: less depth, or a "
-                "larger beam_tilt_rad"
-            )
 
 
 @dataclass(frozen=True)

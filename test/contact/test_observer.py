@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from tactile_resonance.contact.contact_filter import RIGID, hertz_force
-from tactile_resonance.contact.goal import Breach, Cause, Outcome
+from tactile_resonance.contact.goal import Breach, Cause
 from tactile_resonance.contact.observer import Observer, TareError, tare
+from tactile_resonance.contact.outcome import Outcome
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import WrenchSample
 from tactile_resonance.contact.vectors import vector
