@@ -31,6 +31,7 @@ from tactile_resonance.contact.vectors import (
     turn_product,
     vector,
 )
+from tactile_resonance.fields import require
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, -9.80665])
 """Standard gravity in a base that stands upright."""
@@ -54,10 +55,9 @@ class Payload:
     centre_m: Vector
 
     def __post_init__(self) -> None:
-        if not 0 <= self.mass_kg < math.inf:
-            raise ValueError(f"mass_kg: {self.mass_kg!r}, expected a number, 0 or above")
-        if np.shape(self.centre_m) != (3,) or not np.all(np.isfinite(self.centre_m)):
-            raise ValueError(f"centre_m: {self.centre_m!r}, expected 3 finite numbers")
+        require(0 <= self.mass_kg < math.inf, "mass_kg", self.mass_kg, "a number, 0 or above")
+        good = np.shape(self.centre_m) == (3,) and bool(np.all(np.isfinite(self.centre_m)))
+        require(good, "centre_m", self.centre_m, "3 finite numbers")
 
     def wrench(self, turn: Turn) -> Six:
         """Wrench of the payload on the cell, in the cell's frame.
@@ -129,20 +129,16 @@ def identify_payload(
     """
     rotations, wrenches = np.asarray(rotations, float), np.asarray(wrenches, float)
     n = len(rotations)
-    if rotations.shape != (n, 3, 3) or wrenches.shape != (n, 6):
-        raise ValueError(
-            f"shapes: rotations {rotations.shape} and wrenches {wrenches.shape}, "
-            "expected (n, 3, 3) and (n, 6)"
-        )
+    shapes = rotations.shape, wrenches.shape
+    require(shapes == ((n, 3, 3), (n, 6)), "rotations, wrenches", shapes, "shapes (n, 3, 3), (n, 6)")
     # NaN compares as false
     turned = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(initial=0.0) < 1e-6
-    if not (turned and np.all(np.linalg.det(rotations) > 0)):
-        raise ValueError("rotations: expected rotation matrices, orthonormal and not mirrored")
+    good = bool(turned and np.all(np.linalg.det(rotations) > 0))
+    require(good, "rotations", rotations, "rotation matrices, orthonormal and not mirrored")
+    require(bool(np.all(np.isfinite(wrenches))), "wrenches", wrenches, "finite numbers")
     sigma = np.broadcast_to(np.asarray(std, float), (n, 6))
-    if not (np.all(sigma > 0) and np.all(np.isfinite(wrenches))):
-        raise ValueError("std, wrenches: expected finite wrenches and standard deviations above 0")
-    if n < 3:
-        raise ValueError(f"orientations: {n}, expected at least 3")
+    require(bool(np.all(sigma > 0)), "std", std, "numbers above 0")
+    require(n >= 3, "orientations", n, "3 or more")
     gravity = np.einsum("nji,j->ni", rotations, GRAVITY_M_S2)  # (n, 3) in the cell's frame
     equations = np.zeros((n, 6, 10))
     equations[:, :3, 0] = gravity
@@ -155,22 +151,16 @@ def identify_payload(
     scale[scale == 0] = 1.0  # an unknown that no equation holds: found by the condition number
     u, s, vt = np.linalg.svd(a / scale, full_matrices=False)
     condition = float(s[0] / s[-1]) if s[-1] > 0 else math.inf
-    if not condition < LARGEST_CONDITION:
-        raise ValueError(
-            f"orientations: condition number {condition:.3g}, expected below {LARGEST_CONDITION:g}: "
-            "turn the tool about two axes, by 45 degrees or more"
-        )
+    accepted = f"below {LARGEST_CONDITION:g}: turn the tool about two axes, by 45 degrees or more"
+    require(condition < LARGEST_CONDITION, "condition number of orientations", condition, accepted)
     theta = (vt.T @ ((u.T @ b) / s)) / scale
     inverse = (vt.T / s) / scale[:, None]
     covariance = inverse @ inverse.T
     residual = a @ theta - b
     mass = float(theta[0])
     mass_std = math.sqrt(covariance[0, 0])
-    if mass <= 2 * mass_std:
-        raise ValueError(
-            f"mass: {mass:.4g} +- {mass_std:.2g} kg, expected a positive one: check the frame of the "
-            "cell and its signs, or whether it carries anything at all"
-        )
+    accepted = "above two deviations: check the cell's frame and signs, and whether it carries anything"
+    require(mass > 2 * mass_std, "mass_kg", f"{mass:.4g} +- {mass_std:.2g}", accepted)
     # centre = (m c) / m
     jacobian = np.eye(10)
     jacobian[1:4, 1:4] /= mass
@@ -215,10 +205,8 @@ class Mounting:
     payload: Payload | None = None
 
     def __post_init__(self) -> None:
-        if self.mount is Mount.TABLE and self.payload is not None:
-            raise ValueError(
-                "payload: expected none for mount table: the sample goes with the tare"
-            )
+        good = self.mount is not Mount.TABLE or self.payload is None
+        require(good, "payload", self.payload, "none for mount table: the sample goes with the tare")
 
     @cached_property
     def _seat(self) -> tuple[Vector, Turn]:

@@ -140,7 +140,7 @@ def test_orientations_that_tell_nothing_are_refused(turns):
 
 
 def test_a_wrong_sign_is_found():
-    with pytest.raises(ValueError, match="mass: -0.06"):
+    with pytest.raises(ValueError, match="mass_kg: got .-0.06"):
         identify_payload(ORIENTATIONS, -readings(), STD)
 
 
@@ -159,5 +159,5 @@ def test_shapes_are_checked(rotations):
 @pytest.mark.parametrize("factor", [2.0, -1.0, np.nan])
 def test_what_is_no_rotation_is_refused(factor):
     rotations = Rotation.from_euler("xy", [[0, 0], [60, 0], [-60, 0], [0, 60], [0, -60]], True)
-    with pytest.raises(ValueError, match="rotations: expected rotation matrices"):
+    with pytest.raises(ValueError, match="rotations: got .* accepted is rotation matrices"):
         identify_payload(factor * rotations.as_matrix(), np.zeros((5, 6)), np.ones(6))

@@ -19,7 +19,7 @@ from functools import partial
 from typing import Any
 
 from tactile_resonance.clock import PORT as TIME_PORT
-from tactile_resonance.fields import number
+from tactile_resonance.fields import number, require
 from tactile_resonance.simulation.plant.bench_time import BenchTime
 from tactile_resonance.simulation.plant.defaults import CONTROL_PORT
 from tactile_resonance.simulation.ur5e import rtde_server
@@ -283,22 +283,20 @@ class SimulatedRobot:
 
     def _freeze(self, fields: dict) -> None:
         seconds = number(fields.get("seconds"), "seconds")
-        if not 0 < seconds <= _LONGEST_FREEZE_S:
-            raise ValueError(f"seconds: {seconds!r}, expected above 0 to {_LONGEST_FREEZE_S:g}")
+        good = 0 < seconds <= _LONGEST_FREEZE_S
+        require(good, "seconds", seconds, f"above 0 to {_LONGEST_FREEZE_S:g}")
         part = fields.get("part", "network")
+        require(part in ("network", "controller"), "part", part, "'network' or 'controller'")
         until_ns = self.time.now_ns + round(seconds * 1e9)
         if part == "network":  # no packet of the robot's own ports passes; the robot goes on
             self._frozen_until_ns = until_ns
             self.reactor.freeze(True)
-        elif part == "controller":  # all of it stands still, its clock too
+        else:  # all of it stands still, its clock too
             self._halted_until_ns = until_ns
-        else:
-            raise ValueError(f"part: {part!r}, expected 'network' or 'controller'")
 
 
 def _switch(target: Any, name: str, fields: dict) -> None:
     """An order that sets an attribute to its field ``value``."""
     value = fields.get("value")
-    if not isinstance(value, bool):
-        raise ValueError(f"value: {value!r}, expected true or false")
+    require(isinstance(value, bool), "value", value, "true or false")
     setattr(target, name, value)
