@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
+from tactile_resonance.contact.goal import Cause, ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -192,7 +192,7 @@ def run_controller(
     )
     controller = ContactController(parameters, limits)
     loop = ContactLoop(bench.arm, bench.cell, bench, controller)
-    loop.start(ContactGoal(rig.touch, Aim(FORCE_N)))
+    loop.start(ContactGoal(rig.touch, FORCE_N))
     loop.run_while(lambda: controller.result is None)
     ready = len(rig.force_n) if controller.state is State.HOLD else None
     loop.run_while(lambda: controller.state is State.HOLD, 1.0)
@@ -215,7 +215,7 @@ def stiff_peaks(count: int) -> np.ndarray:
         bench = rig.bench
         controller = ContactController(ContactParameters(**KNOWN), Limits())
         loop = ContactLoop(bench.arm, bench.cell, bench, controller)
-        loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))
+        loop.make(ContactGoal(rig.touch, FORCE_N))
         loop.run_while(lambda: True, 0.3)
         peaks.append(max(rig.force_n))
     return np.array(peaks)
@@ -230,10 +230,10 @@ def contact_series(count: int) -> np.ndarray:
     loop = ContactLoop(bench.arm, bench.cell, bench, controller)
     means = []
     for _ in range(count):
-        made = loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))
+        made = loop.make(ContactGoal(rig.touch, FORCE_N))
         if made.cause is Cause.TARE:  # noise passes for a drift of the zero about once in ten thousand tares
             loop.retract()
-            made = loop.make(ContactGoal(rig.touch, Aim(FORCE_N)))
+            made = loop.make(ContactGoal(rig.touch, FORCE_N))
         if not made.reached:
             raise RuntimeError(f"contact {len(means)} failed: {made}")
         rig.force_n.clear()

@@ -24,7 +24,7 @@ from tactile_resonance.clock import WallClock
 from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.free_motion import STILL_M_S
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
@@ -153,7 +153,7 @@ def _contact(
     )
     touch = touch_pose([x, y, TABLE_IN_BASE[2]], [0, 0, 1], [0, -1, 0], RADIUS_M)
     start_s = order(HOST, "truth")["time_s"]
-    loop.start(ContactGoal(touch, Aim(FORCE_N)))
+    loop.start(ContactGoal(touch, FORCE_N))
     loop.run_while(lambda: controller.result is None)
     held = controller.state is State.HOLD
     ready_s = order(HOST, "truth")["time_s"]

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.contact_case import FORCE_N, KNOWN, MODES, Case, Rig, Setup
 from benchmarks.contact_laws import LIVING_LAWS, steps_of
-from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -275,7 +275,7 @@ def _ours(row: Row, rig: Rig) -> Held:
     limits = replace(Limits(depth_m=4.5e-3, approach_s=30.0), **row.limits)
     controller = ContactController(parameters, limits)
     loop = ContactLoop(bench.arm, bench.cell, bench, controller)
-    loop.start(ContactGoal(rig.touch, Aim(row.force_n)))
+    loop.start(ContactGoal(rig.touch, row.force_n))
     loop.run_while(lambda: controller.result is None)
     at, ready = len(rig.force_n), controller.state is State.HOLD
     loop.run_while(lambda: controller.state is State.HOLD, row.hold_s)

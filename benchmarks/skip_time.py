@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop, Cycle
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import read_contact
@@ -117,7 +117,7 @@ def point_times(skipping: Skipping, seed: int = 1) -> PointTimes:
         spent.append(Counter())
         forces_n.append([])
         lowest_m = standoffs.lowest_m(point) if skipping.way else np.inf
-        result = loop.make(ContactGoal(touch, Aim(FORCE_N), lowest_m))
+        result = loop.make(ContactGoal(touch, FORCE_N, standoff_m=lowest_m))
         if not result.reached:
             raise RuntimeError(f"point {point.index + 1}: {result.cause.value}: {result.message}")
         standoffs.add(point, result.surface_m, result.surface_std_m)

@@ -52,18 +52,6 @@ class HoldMode(str, Enum):
 
 
 @dataclass(frozen=True)
-class Aim:
-    """What is asked of a contact: force [N] and what is held then."""
-
-    force_n: float
-    hold: HoldMode = HoldMode.FORCE
-
-    def __post_init__(self) -> None:
-        good = LEAST_FORCE_N <= self.force_n < math.inf
-        require(good, "force_n", self.force_n, f"{1e3 * LEAST_FORCE_N:g} mN or above")
-
-
-@dataclass(frozen=True)
 class ContactGoal:
     """What is asked for.
 
@@ -72,7 +60,8 @@ class ContactGoal:
     touch : Pose
         Of the frame `tip` in the base where the ball just touches the expected surface, +z out of
         the tissue (see `geometry.touch_pose`).
-    aim : Aim
+    force_n : float
+    hold : HoldMode
     standoff_m : float
         Height above the touch where the approach begins and to which the tip is drawn back [m]; infinite: that
         of the parameters, which is never raised.
@@ -85,11 +74,16 @@ class ContactGoal:
     """
 
     touch: Pose
-    aim: Aim
+    force_n: float
+    hold: HoldMode = HoldMode.FORCE
     standoff_m: float = math.inf
     press_speed_m_s: float = math.inf
     hold_s: float = math.inf
     unload_speed_m_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        good = LEAST_FORCE_N <= self.force_n < math.inf
+        require(good, "force_n", self.force_n, f"{1e3 * LEAST_FORCE_N:g} mN or above")
 
 
 class Cause(str, Enum):

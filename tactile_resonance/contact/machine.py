@@ -134,7 +134,7 @@ class ContactController:
     def motion(self) -> TissueMotion | None:
         """How tissue that moves does so under the held tip; None where none is seen."""
         model, goal = self._observer.model, self.goal
-        if model is None or not model.moving or goal is None or goal.aim.hold is not HoldMode.FORCE:
+        if model is None or not model.moving or goal is None or goal.hold is not HoldMode.FORCE:
             return None  # a tip that keeps its place says nothing of the tissue's
         return self._pressing.motion.describe()
 
@@ -453,7 +453,7 @@ class ContactController:
         self._height_m = above = path.height_m(arm)
         if model is not None and self.state in TOUCHING:
             depth = model.surface_m - above
-            self._pressed_n = min(goal.aim.force_n, model.force_at(above))
+            self._pressed_n = min(goal.force_n, model.force_at(above))
             above = -depth
         # the plane of the goal says nothing of what lies lower beside it
         lifted = self.state is State.TRAVEL and self._free.lifts(arm)

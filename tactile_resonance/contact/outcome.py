@@ -147,7 +147,7 @@ class Memory:
 
     def knows(self, goal: ContactGoal, radius_m: float) -> bool:
         """Whether a contact so near to a goal has succeeded."""
-        most_n = goal.aim.force_n / KNOWN_SHARE
+        most_n = goal.force_n / KNOWN_SHARE
         return any(force_n >= most_n for _, force_n in self._near(goal, radius_m))
 
     def keep(self, goal: ContactGoal, result: ContactResult | None, zero: Zero | None) -> None:
@@ -155,7 +155,7 @@ class Memory:
         if result is None or not result.reached:
             return
         if result.cause in (Cause.CANCELLED, Cause.HOLD_ENDED):
-            self._succeeded.append((vector(goal.touch.position_m), goal.aim.force_n))
+            self._succeeded.append((vector(goal.touch.position_m), goal.force_n))
             if result.zero_change_n == 0.0 and zero is not None:
                 self.zero = zero, vector(goal.touch.rotation_rad)
 

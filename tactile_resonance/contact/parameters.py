@@ -311,8 +311,8 @@ def check_goal(goal: ContactGoal, parameters: ContactParameters, limits: Limits)
     good = bool(np.isfinite(goal.touch.vector).all())
     require(good, "touch", goal.touch.vector.tolist(), "six finite numbers")
     most = FORCE_SHARE * limits.abort_force_n
-    good = goal.aim.force_n <= most * (1 + 1e-9)  # two thirds are no round number
-    require(good, "force_n", goal.aim.force_n, f"up to {most:g}, two thirds of abort_force_n")
+    good = goal.force_n <= most * (1 + 1e-9)  # two thirds are no round number
+    require(good, "force_n", goal.force_n, f"up to {most:g}, two thirds of abort_force_n")
     if math.isfinite(goal.hold_s):
         slow, fastest = goal.unload_speed_m_s, parameters.retract_speed_m_s
         unload_s = limits.depth_m / slow if slow > 0 else 0.0

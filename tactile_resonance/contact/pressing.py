@@ -187,11 +187,11 @@ class Pressing:
     def __init__(self, path: TipPath, observer: Observer, touch_speed_m_s: float) -> None:
         goal, limits = path.goal, observer.limits
         self._touch_speed_m_s = touch_speed_m_s
-        self._goal, self._aim, self._path, self._observer = goal, goal.aim, path, observer
+        self._goal, self._path, self._observer = goal, path, observer
         self._parameters, self._limits = observer.parameters, limits
         self.touched_ns = 0
         self.motion = HeldMotion()
-        self._lost_n = limits.lost_below_n(goal.aim.force_n)
+        self._lost_n = limits.lost_below_n(goal.force_n)
         self._sure_ns = 1e9 * (limits.lost_s + LOST_GRACE_S)
         self._within_ns = -1
         self._hold_height_m, self._held_ns = 0.0, 0
@@ -224,11 +224,11 @@ class Pressing:
             if over_s >= 0 and to is None:
                 return self._unload(over_s, arm, place)
         pending = self._observer.arm_model.pending_m
-        if holding and self._aim.hold is HoldMode.INDENTATION:
+        if holding and self._goal.hold is HoldMode.INDENTATION:
             speed = place_speed(self._hold_height_m, place.height_m, pending, p)
         else:
             speed = force_speed(
-                model, place.height_m, pending, self._aim.force_n, p, holding=holding
+                model, place.height_m, pending, self._goal.force_n, p, holding=holding
             )
         most = deepest = p.press_speed_m_s
         if self._touch_speed_m_s < most:
@@ -238,7 +238,7 @@ class Pressing:
             )
         if holding and speed < 0:
             # stiff tissue is not followed faster than the arm can be stopped in before it is too much
-            slope = model.stiffness_at(model.depth_for(self._aim.force_n))
+            slope = model.stiffness_at(model.depth_for(self._goal.force_n))
             deepest = min(deepest, self._limits.abort_force_n / 2 / (slope * REACTION_S))
         twist = self._path.along_normal(arm, min(most, max(-deepest, speed)))
         return Move(twist, to)
@@ -260,7 +260,7 @@ class Pressing:
         self, now_ns: int, state: State, model: ContactFilter, height_m: float, sure: bool
     ) -> State | None:
         """The state that follows while the force comes nearer to what is asked for."""
-        p, aim_n = self._parameters, self._aim.force_n
+        p, aim_n = self._parameters, self._goal.force_n
         off = abs(model.force_at(height_m) - aim_n) / aim_n
         if model.moving:  # what is followed so closely is known less well
             off -= max(0.0, model.estimate(height_m).force_std_n / aim_n - SURE_SHARE)

@@ -14,7 +14,6 @@ from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.cell_checks import require_fit
 from tactile_resonance.contact.goal import (
-    Aim,
     Cause,
     ContactGoal,
     ContactResult,
@@ -110,7 +109,8 @@ class IndentConduct:
         hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
         self.goal = ContactGoal(
             touch_of(request, base_frame, ball.radius_m),
-            Aim(request.force_n, hold),
+            request.force_n,
+            hold,
             press_speed_m_s=request.press_speed_m_s or math.inf,
             hold_s=request.hold_s,
             unload_speed_m_s=request.unload_speed_m_s,
@@ -294,7 +294,7 @@ class ContactNode(ManagedNode):
             test = self._test_of(goal.request) if isinstance(goal.request, Indent.Goal) else None
             radius_m = self._tip.ball_radius_m
             asked = contact_goal(goal.request, self._base_frame, radius_m) if test is None else test.goal
-            require_fit(self._force.info, asked.aim.force_n)
+            require_fit(self._force.info, asked.force_n)
             self._thread.start(asked, self._settings.parameters, limits)
         except ValueError as error:
             self.health.error(f"refused: {error}")

@@ -18,7 +18,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from tactile_resonance import msg
 from tactile_resonance.action import Indent, MakeContact
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
+from tactile_resonance.contact.goal import ContactGoal, HoldMode, State
 from tactile_resonance.contact.vectors import Vector, quaternion_from_vector, turn_from_quaternion
 from tactile_resonance.frf.result import FRF, PER_LINE, BandBins, BandDistortion, FrfStatus
 from tactile_resonance.multisine import Excitation
@@ -263,7 +263,7 @@ def contact_goal(request: MakeContact.Goal, base_frame: str, ball_radius_m: floa
     """
     hold = key_of(HOLDS, request.hold, "hold")
     touch = touch_of(request, base_frame, ball_radius_m)
-    return ContactGoal(touch, Aim(request.force_n, hold), request.standoff_m or math.inf)
+    return ContactGoal(touch, request.force_n, hold, request.standoff_m or math.inf)
 
 
 def touch_of(

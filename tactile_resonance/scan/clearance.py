@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.geometry import TipGeometry, TipPath, TurningWay
-from tactile_resonance.contact.goal import Aim, ContactGoal
+from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.parameters import ContactParameters, Limits, Workspace
 from tactile_resonance.contact.samples import ArmSample, Pose
 from tactile_resonance.contact.vectors import vector
@@ -107,7 +107,7 @@ def way_between(first: ScanPoint, then: ScanPoint, use: TipUse) -> list[Pose]:
     radius, standoff = use.tip.ball_radius_m, use.parameters.standoff_m
     start, end = (_tip_pose(point, radius + standoff) for point in (first, then))
     touch = _tip_pose(then, radius)
-    path = TipPath(ContactGoal(touch, Aim(1.0)), use.tip)
+    path = TipPath(ContactGoal(touch, 1.0), use.tip)
     arm = ArmSample(0, 0.0, vector(start.position_m), vector(start.rotation_rad), (0.0,) * 6)
     if path.off_rad(arm) > use.limits.misalignment_rad / 2:
         limits = replace(use.limits, workspace=ANYWHERE)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal
+from tactile_resonance.contact.goal import ContactGoal, HoldMode
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import ContactParameters, Limits
@@ -64,7 +64,8 @@ def contact(
     start_m=2.5e-3,
     parameters=QUICK,
     limits=None,
-    aim=None,
+    force_n=FORCE_N,
+    hold=HoldMode.FORCE,
     seed=0,
     tip=None,
     under_sample=False,
@@ -86,7 +87,7 @@ def contact(
         parameters, limits, under_sample=under_sample, calm_periods=calm_periods
     )
     loop = ContactLoop(rig.arm, rig.cell, rig, controller)
-    goal = ContactGoal(touch, Aim(FORCE_N) if aim is None else aim)
+    goal = ContactGoal(touch, force_n, hold)
     return Contact(rig, controller, loop, goal)
 
 

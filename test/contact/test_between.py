@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
+from tactile_resonance.contact.goal import Cause, ContactGoal, State
 from tactile_resonance.contact.interfaces import ArmFault, ForceFault
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.payload import Mount
@@ -29,7 +29,7 @@ def made(**options):
 def goal(rig, x_m=0.0, standoff_m=np.inf, turn_rad=0.0):
     touch = rig.goal.touch
     pose = Pose(touch.position_m + [x_m, 0, 0], touch.rotation_rad + [0, 0, turn_rad])
-    return ContactGoal(pose, Aim(FORCE_N), standoff_m)
+    return ContactGoal(pose, FORCE_N, standoff_m=standoff_m)
 
 
 def height_m(rig):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import Aim, Cause, State
+from tactile_resonance.contact.goal import Cause, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.parameters import Limits
@@ -196,6 +196,6 @@ def test_estimate_that_errs_does_not_lead_deeper_than_search_and_depth_allow():
 
 
 def test_two_thirds_of_the_abort_force_may_be_asked_for():
-    made = contact(aim=Aim(0.02))
+    made = contact(force_n=0.02)
     made.loop.start(made.goal)
     assert made.controller.state is State.TRAVEL

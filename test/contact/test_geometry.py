@@ -15,12 +15,12 @@ from tactile_resonance.contact.geometry import (
     TipPath,
     touch_pose,
 )
-from tactile_resonance.contact.goal import Aim, ContactGoal
+from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.parameters import ContactParameters
 from tactile_resonance.contact.samples import ArmSample
 from tactile_resonance.contact.vectors import vector
 
-GOAL = ContactGoal(touch_pose([0.1, -0.2, 0.3], [0.2, -0.1, 1.0], [1, 1, 0], 2.5e-3), Aim(0.01))
+GOAL = ContactGoal(touch_pose([0.1, -0.2, 0.3], [0.2, -0.1, 1.0], [1, 1, 0], 2.5e-3), 0.01)
 TOUCH, P = GOAL.touch, ContactParameters()
 NORMAL = TOUCH.rotation.as_matrix()[:, 2]
 STILL = (0.0,) * 6

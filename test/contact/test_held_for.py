@@ -8,18 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import Aim, Cause, HoldMode, State
+from tactile_resonance.contact.goal import Cause, HoldMode, State
 from tactile_resonance.contact.loop import IndentationRecorder
 from tactile_resonance.mechanics.indentation import BallTip, Protocol
 
 sys.path.insert(0, str(Path(__file__).parent))
-from contacts import FORCE_N, RADIUS_M, contact
-
-IN_PLACE = Aim(FORCE_N, HoldMode.INDENTATION)
+from contacts import RADIUS_M, contact
 
 
 def made(**goal):
-    rig = contact(aim=IN_PLACE, height_m=0.0, under_sample=True)
+    rig = contact(hold=HoldMode.INDENTATION, height_m=0.0, under_sample=True)
     rig.goal = replace(rig.goal, **goal)
     recorder = IndentationRecorder(
         rig.goal, Protocol.INDENTATION, BallTip(RADIUS_M), "cell", simulated=True

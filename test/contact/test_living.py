@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.contact_living import BONE_ROWS, run_case
-from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
+from tactile_resonance.contact.goal import Cause, ContactGoal, State
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.pressing import HeldMotion
 from tactile_resonance.sensor import read_sensor
@@ -101,7 +101,7 @@ def test_where_one_pressed_too_hard_the_next_touch_is_slow_again():
     assert made.loop.retract().retracted
     controller = made.controller
     assert is_known(controller, made.goal)
-    harder = ContactGoal(made.goal.touch, Aim(0.018))
+    harder = ContactGoal(made.goal.touch, 0.018)
     assert not is_known(controller, harder)  # as deep as that nobody has been
     made.bench.plant._on = RigidTip(
         OnSoft(made.bench.plant._on.indenter, bone(1e-4, RADIUS_M))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance.clock import WallClock
 from tactile_resonance.contact.cell_checks import require_fit
 from tactile_resonance.contact.geometry import TipGeometry, touch_pose
-from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, HoldMode, NotIdleError, State
+from tactile_resonance.contact.goal import Cause, ContactGoal, HoldMode, NotIdleError, State
 from tactile_resonance.contact.interfaces import ArmError, ArmFault
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
@@ -68,7 +68,7 @@ def test_all_six_axes_go_to_the_pose_of_the_point():
     made.bench.plant.surface = type(made.bench.plant.surface)(
         np.array([0.02, -0.01, 0.0]), touch.rotation.as_matrix()[:, 2]
     )
-    assert made.loop.make(ContactGoal(touch, Aim(FORCE_N))).reached
+    assert made.loop.make(ContactGoal(touch, FORCE_N)).reached
     tip = made.bench.motion.reported
     assert (touch.rotation * tip.rotation.inv()).magnitude() < 0.01
     normal = touch.rotation.as_matrix()[:, 2]
@@ -78,7 +78,7 @@ def test_all_six_axes_go_to_the_pose_of_the_point():
 
 
 def test_indentation_is_held_while_the_force_decays():
-    made = contact(aim=Aim(FORCE_N, HoldMode.INDENTATION))
+    made = contact(hold=HoldMode.INDENTATION)
     assert made.loop.make(made.goal).reached
     made.run(0.2)
     place, force = made.bench.motion.reported.position_m[2], made.force_n[-1]
@@ -124,10 +124,10 @@ def test_parameters_are_refused_in_contact_and_nothing_changes():
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
-        (lambda t: ContactGoal(t, Aim(0.025)), "force_n: got 0.025"),
-        (lambda t: ContactGoal(Pose(t.position_m * np.nan, t.rotation_rad), Aim(0.01)), "finite"),
-        (lambda t: ContactGoal(Pose(t.position_m + 5, t.rotation_rad), Aim(0.01)), "workspace"),
-        (lambda t: ContactGoal(Pose(t.position_m, np.array([1.0, 0, 0])), Aim(0.01)), "tilted"),
+        (lambda t: ContactGoal(t, 0.025), "force_n: got 0.025"),
+        (lambda t: ContactGoal(Pose(t.position_m * np.nan, t.rotation_rad), 0.01), "finite"),
+        (lambda t: ContactGoal(Pose(t.position_m + 5, t.rotation_rad), 0.01), "workspace"),
+        (lambda t: ContactGoal(Pose(t.position_m, np.array([1.0, 0, 0])), 0.01), "tilted"),
     ],
 )
 def test_goals_beyond_the_limits_are_refused(goal, message):
@@ -188,7 +188,7 @@ def test_a_fifth_of_the_usual_force_is_held_and_its_loss_is_told(seed):
     cell = replace(CellParameters.from_yaml(), force_noise_rms_n=2e-4, force_divisor=20000.0)
     cell = replace(cell, force_bias_n=(0.0, 0.0, 0.5))  # most of the dish: within its counts
     parameters = replace(QUICK, cell_noise_n=2e-4)
-    made = contact(parameters=parameters, cell_parameters=cell, aim=Aim(2e-3), seed=seed)
+    made = contact(parameters=parameters, cell_parameters=cell, force_n=2e-3, seed=seed)
     require_fit(made.bench.cell.info, 2e-3)
     result = made.loop.make(made.goal)
     assert result.reached, result.message
@@ -286,7 +286,7 @@ def test_a_way_from_afar_from_below_or_with_a_turn_is_within_its_box(start_m, tu
     made = contact(start_m=start_m)
     place_m, turn = made.goal.touch.position_m, made.goal.touch.rotation
     turned = Rotation.from_rotvec([0.0, 0.0, turned_rad]) * turn
-    goal = ContactGoal(Pose(place_m, turned.as_rotvec()), made.goal.aim)
+    goal = replace(made.goal, touch=Pose(place_m, turned.as_rotvec()))
     result = made.loop.make(goal)
     assert result.reached, result.message
 
@@ -355,7 +355,9 @@ def test_tip_left_pressing_beside_the_goal_is_lifted_before_it_goes_along():
     assert made.loop.make(made.goal).reached
     # a new controller knows nothing of that; its goal lies 3 mm beside
     touch = made.goal.touch
-    beside = ContactGoal(Pose(touch.position_m + [3e-3, 0, 0], touch.rotation_rad), made.goal.aim)
+    beside = replace(
+        made.goal, touch=Pose(touch.position_m + [3e-3, 0, 0], touch.rotation_rad)
+    )
     controller = ContactController(QUICK, Limits())
     loop = ContactLoop(made.bench.arm, made.bench.cell, made.bench, controller)
     way, since = [], len(made.force_n)
@@ -369,7 +371,7 @@ def test_tip_left_pressing_beside_the_goal_is_lifted_before_it_goes_along():
 
 
 def test_force_that_leaves_a_tip_left_pressing_is_no_touch():
-    made = contact(height_m=0.0, aim=Aim(0.018))
+    made = contact(height_m=0.0, force_n=0.018)
     assert made.loop.make(made.goal).reached
     # a new controller knows nothing of that, and is to touch at the same place
     controller = ContactController(QUICK, Limits())

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_resonance.contact.goal import Aim, HoldMode, State
+from tactile_resonance.contact.goal import HoldMode, State
 from tactile_resonance.contact.interfaces import ArmFault, ForceFault
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.vectors import vector
@@ -184,7 +184,8 @@ def storm(rng, names):
         height_m=height_m,
         tilt_rad=rng.choice([0.0, rng.uniform(0, 0.17)]),
         start_m=start_m,
-        aim=Aim(rng.choice([0.005, 0.01, 0.018]), hold),
+        force_n=rng.choice([0.005, 0.01, 0.018]),
+        hold=hold,
         parameters=replace(QUICK, cell_noise_n=noise_n, tare_std_n=0.3 * noise_n),
         limits=Limits(),
         seed=int(rng.integers(1 << 30)),

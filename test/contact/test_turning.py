@@ -17,7 +17,7 @@ from tactile_resonance.contact.geometry import (
     TurningWay,
     touch_pose,
 )
-from tactile_resonance.contact.goal import Aim, Cause, ContactGoal, State
+from tactile_resonance.contact.goal import Cause, ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits, Workspace
@@ -30,7 +30,7 @@ from tactile_resonance.simulation.plant.tip import Tip
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import FORCE_N, QUICK, RADIUS_M, SOFT
 
-TIP, LIMITS, AIM = TipGeometry(), Limits(), Aim(FORCE_N)
+TIP, LIMITS = TipGeometry(), Limits()
 EDGE = np.array([-0.064 * np.cos(0.17), 0.0, 0.064 * np.sin(0.17) - 6e-3])  # of the housing
 STILL = (0.0,) * 6
 
@@ -80,7 +80,7 @@ def test_turns_are_just_so_high_that_the_whole_arc_is_clear_of_both_planes(press
         old, new = random_touch(rng), random_touch(rng)
         # a tip that was left pressing stands below where the ball touches the surface
         start = raised(old, -LIMITS.depth_m) if pressed else old
-        way = TurningWay(TipPath(ContactGoal(new, AIM), TIP), sample(start), QUICK, LIMITS)
+        way = TurningWay(TipPath(ContactGoal(new, FORCE_N), TIP), sample(start), QUICK, LIMITS)
         places, turns = stops(way)
         np.testing.assert_allclose(places[1:4] - places[1], 0, atol=1e-15)  # turned in one place
         assert (turns[0].inv() * start.rotation).magnitude() < 1e-9
@@ -121,7 +121,7 @@ def test_half_a_turn_is_clear_of_both_planes_either_way_round(short_rad):
         swung = Rotation.from_rotvec(swing) * old.rotation
         half = Rotation.from_rotvec((np.pi - short_rad) * normal)
         new = Pose(first.position_m, (half * swung).as_rotvec())
-        way = TurningWay(TipPath(ContactGoal(new, AIM), TIP), sample(old), QUICK, LIMITS)
+        way = TurningWay(TipPath(ContactGoal(new, FORCE_N), TIP), sample(old), QUICK, LIMITS)
         angles = np.linspace(0, 2 * np.pi, 400)
         circle = Rotation.from_rotvec(angles[:, None] * normal) * swung
         for touch, up in ((old, LIMITS.depth_m), (new, QUICK.early_m)):
@@ -149,7 +149,7 @@ class Travel:
 
     def go(self, touch):
         self.loop.cycle()
-        self.loop.start(ContactGoal(touch, AIM))
+        self.loop.start(ContactGoal(touch, FORCE_N))
         self.loop.run_while(lambda: self.controller.state is State.TRAVEL, 60.0)
         assert self.controller.state is State.TARE, self.controller.result
 
@@ -212,7 +212,7 @@ def test_points_of_a_sphere_follow_each_other(angle_deg, hollow):
     curved = PlantSurface(np.zeros(3), np.array([0, 0, 1.0]), (-1 if hollow else 1) / radius)
     made = Travel(raised(first, 2.5e-3), surface=curved)
     for touch in (first, second, first):
-        result = made.loop.make(ContactGoal(touch, AIM))
+        result = made.loop.make(ContactGoal(touch, FORCE_N))
         assert result.reached, result.message
         assert made.loop.retract().retracted
     touched = np.array(made.force_n) > 0
@@ -226,7 +226,7 @@ TURNED_DOWN = [(0.0, -0.35, 0.0), (0.25, -0.2, 0.6)]
 def start_and_top(turn_rad):
     """A tip that stands turned above a level surface, and the height that it has to rise to."""
     start = Pose(LEVEL.position_m + [0, 0, 0.012], np.array(turn_rad))
-    way = TurningWay(TipPath(ContactGoal(LEVEL, AIM), TIP), sample(start), QUICK, LIMITS)
+    way = TurningWay(TipPath(ContactGoal(LEVEL, FORCE_N), TIP), sample(start), QUICK, LIMITS)
     return start, max(stops(way)[0][:, 2])
 
 
@@ -243,7 +243,7 @@ def test_turn_that_has_no_room_in_the_workspace_is_refused_with_its_figures(turn
         with pytest.raises(
             ValueError, match=r"to turn by 0\.\d+ rad .* has to rise by .* mm .* outside"
         ) as told:
-            made.loop.start(ContactGoal(LEVEL, AIM))
+            made.loop.start(ContactGoal(LEVEL, FORCE_N))
         assert f"{top:.3f} m" in str(told.value)
         assert made.controller.state is State.IDLE
 
@@ -253,7 +253,7 @@ def test_goal_begun_before_the_arm_was_seen_ends_before_it_turns(turn_rad):
     start, top = start_and_top(turn_rad)
     box = Workspace(LIMITS.workspace.low_m, (1.0, 1.0, top - 1e-3))
     made = Travel(start, replace(LIMITS, workspace=box))
-    result = made.loop.make(ContactGoal(LEVEL, AIM))
+    result = made.loop.make(ContactGoal(LEVEL, FORCE_N))
     assert result.cause is Cause.HOUSING
     assert "outside of the workspace" in result.message
     made.loop.run_while(lambda: made.controller.state is not State.IDLE, 3.0)
@@ -266,7 +266,7 @@ def test_contact_given_up_while_it_leaves_a_surface_is_drawn_off_that_surface():
     old, new = random_touch(rng), random_touch(rng)
     made = Travel(raised(old, -1e-3))
     made.loop.cycle()
-    made.loop.start(ContactGoal(new, AIM))
+    made.loop.start(ContactGoal(new, FORCE_N))
     made.loop.run_while(lambda: True, 0.05)
     made.loop.retract()
     assert made.controller.state is State.IDLE

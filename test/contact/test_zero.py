@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal, State
+from tactile_resonance.contact.goal import ContactGoal, State
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.observer import Zero
@@ -97,7 +97,7 @@ def test_the_weight_on_a_cell_under_the_sample_does_not_turn_with_the_tip(turned
     bench = ContactBench(SOFT, PlantSurface(np.zeros(3), normal), start, tip=Tip(RADIUS_M))
     controller = ContactController(QUICK, Limits(), under_sample=True)
     loop = ContactLoop(bench.arm, bench.cell, bench, controller)
-    loop.start(ContactGoal(touch, Aim(FORCE_N)))
+    loop.start(ContactGoal(touch, FORCE_N))
     loop.run_while(lambda: controller.state not in (State.HOLD, State.FAULT), 20.0)
     assert controller.state is State.HOLD, controller.result
     true_n = []

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal
+from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits
@@ -262,7 +262,7 @@ def test_normal_of_a_sphere_of_tissue_is_found_by_contacts(hollow):
 
     def touch(point):
         pose = touch_pose(point.position_m, point.normal, [1, 0, 0], RADIUS_M)
-        result = loop.make(ContactGoal(pose, Aim(FORCE_N)))
+        result = loop.make(ContactGoal(pose, FORCE_N))
         if not result.reached:
             raise PointFailed(result.message)
         loop.retract()
@@ -280,4 +280,4 @@ def test_normal_of_a_sphere_of_tissue_is_found_by_contacts(hollow):
     assert np.linalg.norm(place - centre) == pytest.approx(10e-3, abs=4e-4)
     # and the contact is then made along what was found
     pose = touch_pose(found.position_m, found.normal, [1, 0, 0], RADIUS_M)
-    assert loop.make(ContactGoal(pose, Aim(FORCE_N))).reached
+    assert loop.make(ContactGoal(pose, FORCE_N)).reached

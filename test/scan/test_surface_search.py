@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal
+from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.scan.hands import PointFailed, SurfaceMissing, Touch
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import read_scan_scene
@@ -197,7 +197,7 @@ def test_contacts_on_soft_tissue_tell_a_tilted_surface():
 
         def touch(point, made=made):
             pose = touch_pose(point.position_m, point.normal, [1, 0, 0], RADIUS_M)
-            result = made.loop.make(ContactGoal(pose, Aim(0.005)))
+            result = made.loop.make(ContactGoal(pose, 0.005))
             assert result.reached, result.message
             made.loop.retract()
             x, y, z = point.position_m

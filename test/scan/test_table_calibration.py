@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal
+from tactile_resonance.contact.goal import ContactGoal
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.surface_search import LEAST_TOUCH_STD_M
@@ -177,7 +177,7 @@ def test_touches_of_the_contact_keep_what_they_state():
 
         def touch(point, bench=bench):
             pose = touch_pose(point.position_m, point.normal, [1, 0, 0], RADIUS_M)
-            result = bench.loop.make(ContactGoal(pose, Aim(0.01)))
+            result = bench.loop.make(ContactGoal(pose, 0.01))
             assert result.reached, result.message
             bench.loop.retract()
             x, y, z = point.position_m

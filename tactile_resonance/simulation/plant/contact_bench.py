@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.clock import Clock, Demand
 from tactile_resonance.contact.geometry import touch_pose
-from tactile_resonance.contact.goal import Aim, ContactGoal, HoldMode, State
+from tactile_resonance.contact.goal import ContactGoal, HoldMode, State
 from tactile_resonance.contact.interfaces import (
     ArmError,
     ArmFault,
@@ -451,7 +451,7 @@ def indent_tissue(
         seed=seed,
     )
     hold = HoldMode.FORCE if protocol is Protocol.CREEP else HoldMode.INDENTATION
-    goal = ContactGoal(touch, Aim(force_n, hold), hold_s=hold_s, unload_speed_m_s=unload_speed_m_s)
+    goal = ContactGoal(touch, force_n, hold, hold_s=hold_s, unload_speed_m_s=unload_speed_m_s)
     ball = BallTip(radius_m, poisson_ratio, stiffness)
     recorder = IndentationRecorder(goal, protocol, ball, bench.cell.info.name, simulated=True)
     controller = ContactController(parameters, limits, under_sample=True)
