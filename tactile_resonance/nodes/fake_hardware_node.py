@@ -267,52 +267,45 @@ class FakeHardwareNode(ManagedNode):
         return ""
 
     def _on_play(self, request: Play.Request, response: Play.Response) -> Play.Response:
-        try:
-            self.require_active()
-            asked = request.excitation
-            if asked.excitation_id and self._played is not None and self._played[0] == asked:
-                return self._played[1]  # asked again: the answer was lost, or late
-            excitation = excitation_from_message(asked)
-            effects = BenchEffects(**dict(zip(EFFECTS, values(self, *EFFECTS), strict=True)))
-            (seed,) = values(self, "seed")
-            # noise repeats with the excitation's own seed, whatever was played before
-            entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
-            start_ns = self._now_ns()  # of the contact that is taken up, too, however long it takes to begin
-            tip, so_far = self._touch.take_up(), None
-            pressed = tip.tissue is not None and self._touch.creeps
-            if pressed and not effects.nonlinearity:  # which takes the contact as fixed
-                so_far = ContactSoFar(self._bench, tip)
-            coupled = tip.coupled(self._bench) if so_far is None else so_far.coupled_at
-            noise_seed = int(entropy.generate_state(1, np.uint64)[0])
-            run = BenchRun(self._bench.sensor, coupled, noise_seed, effects)
-            self._silence()
-            ends_ns = (
-                start_ns + round(count * excitation.period_s * 1e9)
-                for count in range(1, excitation.periods + 1)
-            )
-            hand_out = self._hand_out(run, excitation, start_ns, so_far, pressed)
-            self._playing = Playing(self.time_server, ends_ns, hand_out)
-        except (ValueError, ClockLostError) as error:
-            response.message = str(error)
-            return response
+        self.require_active()
+        asked = request.excitation
+        if asked.excitation_id and self._played is not None and self._played[0] == asked:
+            return self._played[1]  # asked again: the answer was lost, or late
+        excitation = excitation_from_message(asked)
+        effects = BenchEffects(**dict(zip(EFFECTS, values(self, *EFFECTS), strict=True)))
+        (seed,) = values(self, "seed")
+        # noise repeats with the excitation's own seed, whatever was played before
+        entropy = np.random.SeedSequence([seed, excitation.seed, excitation.realisation])
+        start_ns = self._now_ns()  # of the contact that is taken up, too, however long it takes to begin
+        tip, so_far = self._touch.take_up(), None
+        pressed = tip.tissue is not None and self._touch.creeps
+        if pressed and not effects.nonlinearity:  # which takes the contact as fixed
+            so_far = ContactSoFar(self._bench, tip)
+        coupled = tip.coupled(self._bench) if so_far is None else so_far.coupled_at
+        noise_seed = int(entropy.generate_state(1, np.uint64)[0])
+        run = BenchRun(self._bench.sensor, coupled, noise_seed, effects)
+        self._silence()
+        ends_ns = (
+            start_ns + round(count * excitation.period_s * 1e9)
+            for count in range(1, excitation.periods + 1)
+        )
+        hand_out = self._hand_out(run, excitation, start_ns, so_far, pressed)
+        self._playing = Playing(self.time_server, ends_ns, hand_out)
         response.accepted, response.start = True, time_message(start_ns)
         self._played = asked, response
         return response
 
     def _on_truth(self, request: Truth.Request, response: Truth.Response) -> Truth.Response:
         place = request.position
-        try:
-            self.require_active()
-            tip = self._touch.take_up() if request.here else self._touch.at((place.x, place.y, place.z))
-            coupled = replace(
-                tip,
-                force_n=request.force_n or tip.force_n,
-                since_s=request.hold_time_s or tip.since_s,
-                **(HERTZ if request.force_n or request.hold_time_s else {}),
-            ).coupled(self._bench)
-            truth_to_response(coupled, request.frequency_hz, response)
-        except (ValueError, ClockLostError) as error:
-            response.message = str(error)
+        self.require_active()
+        tip = self._touch.take_up() if request.here else self._touch.at((place.x, place.y, place.z))
+        coupled = replace(
+            tip,
+            force_n=request.force_n or tip.force_n,
+            since_s=request.hold_time_s or tip.since_s,
+            **(HERTZ if request.force_n or request.hold_time_s else {}),
+        ).coupled(self._bench)
+        truth_to_response(coupled, request.frequency_hz, response)
         return response
 
     def _hand_out(

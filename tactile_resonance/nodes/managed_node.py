@@ -166,10 +166,21 @@ class ManagedNode(LifecycleNode):
         self.resources.callback(self.destroy_subscription, subscription)
 
     def serve(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
-        """Service until the node is cleaned up; the callback sees to `active` itself, and may wait."""
+        """Service until the node is cleaned up; the callback sees to `active` itself, and may wait.
+
+        What it refuses with one of `REFUSALS` is answered by why, in the response's field ``message``.
+        """
+
+        async def serve(request: Any, response: Any) -> Any:
+            try:
+                return await await_or_execute(callback, request, response)
+            except REFUSALS as error:
+                response.message = str(error)
+            return response
+
         # in the node's own group, whose callbacks exclude each other, one that waits would keep all waiting
         group = ReentrantCallbackGroup()
-        service = self.create_service(kind, name, callback, callback_group=group)
+        service = self.create_service(kind, name, serve, callback_group=group)
         send = service.send_response
 
         def send_if_there(response: Any, header: Any) -> None:
@@ -183,11 +194,8 @@ class ManagedNode(LifecycleNode):
         """Service without a request; `do` returns the answer, or raises one of `REFUSALS` with why."""
 
         async def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            try:
-                response.message = await await_or_execute(do)
-                response.success = True
-            except REFUSALS as error:
-                response.message = str(error)
+            response.message = await await_or_execute(do)
+            response.success = True
             return response
 
         self.serve(Trigger, name, serve)

@@ -13,7 +13,7 @@ pytest.importorskip("tactile_resonance.msg", reason="the messages are not built"
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from spinning import spin_until
-from tactile_resonance.srv import Play
+from tactile_resonance.srv import Play, Truth
 
 from tactile_resonance import msg
 from tactile_resonance.multisine import design_multisine
@@ -190,3 +190,15 @@ def test_contact_over_a_long_block_is_asked_for_in_as_many_parts_as_are_answered
     second = 10**9
     assert node._touch.contact_over(second, 3 * second) == [None] * 50
     assert node._touch.contact_over(second, 21 * second) == [None] * MOST_STEPS
+
+
+def test_what_the_bench_refuses_is_answered_by_why(node):
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    node.trigger_deactivate()
+    for kind, name in ((Play, "bench/play"), (Truth, "bench/get_truth")):
+        client = node.create_client(kind, name)
+        assert spin_until(executor, client.service_is_ready)
+        answer = client.call_async(kind.Request())
+        assert spin_until(executor, answer.done)
+        assert answer.result().message == "fake_hardware_node is inactive"
