@@ -17,7 +17,15 @@ from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.scan.goal import ScanGoal
-from tactile_resonance.scan.hands import Controls, Progress, Request, Summary
+from tactile_resonance.scan.hands import (
+    Controls,
+    Interrupted,
+    PointFailed,
+    Progress,
+    Request,
+    ScanEnded,
+    Summary,
+)
 from tactile_resonance.scan.table_calibration import (
     NOT_ESTIMATED,
     CalibrationRequest,
@@ -67,9 +75,9 @@ class OneGoal:
         kind: type,
         name: str,
         check: Callable[[Any], Awaitable[Any]],
-        work: Callable[[ServerGoalHandle, Any], Any],
+        work: Callable[[ServerGoalHandle, Any, Any], None],
         done: int,
-        busy: Any,
+        unknown: Callable[[], Any],
     ) -> None:
         """Offer an action.
 
@@ -80,11 +88,12 @@ class OneGoal:
         check : callable
             Awaited with the goal; raises ``ValueError`` or ``OSError`` where it is wrong.
         work : callable
-            Called in a thread with the handle of the goal and what its check has returned; returns the result.
+            Called in a thread with the handle of the goal, what its check has returned and the result, to be
+            filled in; what it raises is the result's message.
         done : int
             The result's field ``outcome`` of a goal that has succeeded.
-        busy : message
-            Result of a goal that was accepted beside another one.
+        unknown : callable
+            Makes the result of a goal of which nothing came.
         """
         found: dict[int, Any] = {}  # by the check of a goal, by its message
 
@@ -109,16 +118,27 @@ class OneGoal:
             return bool(reason)
 
         async def serve(goal: ServerGoalHandle) -> Any:
-            checked = found.pop(id(goal.request))
+            checked, result = found.pop(id(goal.request)), unknown()
             if self.handle is not None:
                 goal.abort()
-                return busy
+                result.message = RUNNING
+                return result
             self.handle, self.controls, self._action = goal, Controls(), name
             if goal.is_cancel_requested or not self._node.active:  # before there were controls
                 self.cancel()
+
+            def do() -> None:
+                try:
+                    work(goal, checked, result)
+                except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
+                    result.message = str(error) or "cancelled"
+                    self._node.health.error(result.message)
+                except Exception as error:  # an answer without this would tell of a goal that is done
+                    result.message = self._node.health.failed(name, error)
+
             try:
                 with self._around():
-                    result = await in_thread(self._node, lambda: work(goal, checked), "goal")
+                    await in_thread(self._node, do, "goal")
             finally:
                 self.handle = self.controls = None
             end_goal(goal, result.outcome == done)
@@ -204,9 +224,9 @@ def calibration_request(message: CalibrateTable.Goal) -> CalibrationRequest:
     return CalibrationRequest(points, **given)
 
 
-def no_table(outcome: int, message: str = "") -> CalibrateTable.Result:
+def no_table() -> CalibrateTable.Result:
     """Result without a table: no figure of it is known."""
-    result = CalibrateTable.Result(outcome=outcome, message=message)
+    result = CalibrateTable.Result(outcome=CalibrateTable.Result.FAILED)
     result.table_in_base, result.covariance = [math.nan] * 6, [math.nan] * 9
     for name in ("height_m", "tilt_x_rad", "tilt_y_rad", "reduced_chi_square"):
         setattr(result, name, math.nan)

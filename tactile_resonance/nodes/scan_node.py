@@ -23,7 +23,6 @@ from tactile_resonance.nodes.managed_node import HUNG_AFTER, TIME_SERVER, Manage
 from tactile_resonance.nodes.parameters import Fixed, Parameter, pose_of, values
 from tactile_resonance.nodes.running import POINT_RESULTS
 from tactile_resonance.nodes.scan_actions import (
-    RUNNING,
     OneGoal,
     calibration_request,
     fill_calibration_result,
@@ -34,15 +33,7 @@ from tactile_resonance.nodes.scan_actions import (
 )
 from tactile_resonance.nodes.scan_hands import NodeHands
 from tactile_resonance.scan.goal import Frames, GoalFiles, named_frames, resumed_run
-from tactile_resonance.scan.hands import (
-    Interrupted,
-    Phase,
-    PointFailed,
-    Progress,
-    Request,
-    ScanEnded,
-    Touch,
-)
+from tactile_resonance.scan.hands import Phase, Progress, Request, Touch
 from tactile_resonance.scan.point_result import TOPIC
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.recorded import recorded_results
@@ -121,11 +112,10 @@ class ScanNode(ManagedNode):
         goals = self._goals = OneGoal(self, self._hands.listening)
         for name, ask in CONTROLS.items():
             goals.serve_control(name, ask)
-        done, busy = Scan.Result.COMPLETE, Scan.Result(outcome=Scan.Result.REFUSED, message=RUNNING)
-        goals.act(Scan, "scan", self._check_scan, self._scan, done, busy)
-        done, busy = CalibrateTable.Result.DONE, no_table(CalibrateTable.Result.FAILED, RUNNING)
-        check = self._check_calibration
-        goals.act(CalibrateTable, "calibrate_table", check, self._calibrate, done, busy)
+        done, refused = Scan.Result.COMPLETE, partial(Scan.Result, outcome=Scan.Result.REFUSED)
+        goals.act(Scan, "scan", self._check_scan, self._scan, done, refused)
+        check, done = self._check_calibration, CalibrateTable.Result.DONE
+        goals.act(CalibrateTable, "calibrate_table", check, self._calibrate, done, no_table)
 
     def deactivate(self) -> None:
         """End the scan after retracting; its points stay finished."""
@@ -178,8 +168,8 @@ class ScanNode(ManagedNode):
     # in the thread of a goal
 
     def _calibrate(
-        self, goal: ServerGoalHandle, request: CalibrationRequest
-    ) -> CalibrateTable.Result:
+        self, goal: ServerGoalHandle, request: CalibrationRequest, result: CalibrateTable.Result
+    ) -> None:
         """Touch, fit and save."""
         # those of this configuration: the node may have another one before the tip is back
         hands, frames, check = self._hands, self._frames, self._goals.controls.check_cancelled
@@ -196,19 +186,15 @@ class ScanNode(ManagedNode):
             feedback.height_m = found.ball_m[2] - radius_m
             return found
 
-        result = no_table(CalibrateTable.Result.FAILED)
         file = None
         try:
             with hands.at_work():
                 file = _new_file(request.file) if request.file else None
                 hands.retract()
                 made = calibrate_table(request, frames.table_in_base, radius_m, touch)
-        except (PointFailed, ScanEnded, Interrupted) as error:
-            result.message = str(error) or "cancelled"
-        except ValueError as error:
-            result.outcome, result.message = result.REFUSED, str(error)
-        except Exception as error:  # an answer without this would tell of a table that was found
-            result.message = self.health.failed("calibration", error)
+        except ValueError:
+            result.outcome = result.REFUSED
+            raise
         else:
             fill_calibration_result(result, made)
             if file is not None:
@@ -231,23 +217,13 @@ class ScanNode(ManagedNode):
                 file.close()
                 if not result.file:
                     Path(request.file).unlink()
-        if result.outcome != result.DONE:
-            self.health.error(result.message)
-        return result
 
-    def _scan(self, goal: ServerGoalHandle, frames: Frames) -> Scan.Result:
-        result = Scan.Result(outcome=Scan.Result.REFUSED)
+    def _scan(self, goal: ServerGoalHandle, frames: Frames, result: Scan.Result) -> None:
         try:
             with self._hands.at_work():
                 self._run(goal, frames, result)
-        except (ValueError, OSError, PointFailed, ScanEnded, Interrupted) as error:
-            result.message = str(error) or "cancelled before the first point"
-            self.health.error(result.message)
-        except Exception as error:  # an answer without this would tell of a complete scan
-            result.message = self.health.failed("scan", error)
         finally:
             self._progress, self._told, self._run_directory = None, None, ""
-        return result
 
     def _run(self, goal: ServerGoalHandle, frames: Frames, result: Scan.Result) -> None:
         """Open the run and scan; the result is filled in as far as that comes."""

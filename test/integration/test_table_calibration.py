@@ -24,7 +24,7 @@ from tactile_resonance.commands.calibrate_table import NODES, SIMULATED_POINTS, 
 from tactile_resonance.configuration import share_path
 from tactile_resonance.nodes.client import HANGS_S, ScanClient
 from tactile_resonance.nodes.running import STREAM
-from tactile_resonance.nodes.scan_node import RUNNING
+from tactile_resonance.nodes.scan_actions import RUNNING
 from tactile_resonance.processes import NodeProcesses, noting_signals
 from tactile_resonance.scan.table_calibration import read_table
 

@@ -26,10 +26,11 @@ from tactile_resonance.msg import PointResult
 
 from tactile_resonance import client as client_module
 from tactile_resonance.client import CalibrationOutcome, Ending, ScanOutcome, TactileClient
-from tactile_resonance.nodes import goals, scan_goal, scan_node
+from tactile_resonance.nodes import goals, scan_actions, scan_goal, scan_node
 from tactile_resonance.nodes.client import NoAnswer
 from tactile_resonance.nodes.running import POINT_RESULTS, POLES, initialised
-from tactile_resonance.nodes.scan_node import RUNNING, ScanNode
+from tactile_resonance.nodes.scan_actions import RUNNING
+from tactile_resonance.nodes.scan_node import ScanNode
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.scan.run_content import checksum_of
 from test.spinning import spin_until
@@ -478,22 +479,22 @@ def test_a_run_that_began_otherwise_is_not_resumed(stack, name, now, began, told
 
 
 @pytest.mark.parametrize("stack", [SingleThreadedExecutor], indirect=True)
-@pytest.mark.parametrize("where", ["start_run", "_scan"])
+@pytest.mark.parametrize("where", ["start_run", "in_thread"])
 def test_a_scan_that_a_defect_ends_is_not_complete(stack, monkeypatch, where):
     """ROS answers with an empty result then, whose outcome is that of a complete scan."""
 
     def defect(*_, **__):
         raise KeyError("what nobody thought of")
 
-    monkeypatch.setattr(scan_node if where == "start_run" else ScanNode, where, defect)
+    monkeypatch.setattr(scan_node if where == "start_run" else scan_actions, where, defect)
     stack.activate()
     outcome = stack.ended(stack.client.scan(**{**GOAL, "run_directory": stack.folder / "run"}))
     expected = {
         "start_run": (Ending.REFUSED, "KeyError: 'what nobody thought of'"),
-        "_scan": (Ending.LOST, "scan_node failed in it, its log says how"),
+        "in_thread": (Ending.LOST, "scan_node failed in it, its log says how"),
     }
     assert (outcome.ending, outcome.message) == expected[where]
-    if where == "_scan":
+    if where == "in_thread":
         return
     monkeypatch.undo()
     heard = []

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 from tactile_resonance.nodes import scan_actions
+from tactile_resonance.scan.hands import Interrupted, ScanEnded
 
 
 class Node:
@@ -26,6 +27,10 @@ class Node:
 
     def act(self, kind, name, serve, on_cancel, refuses):
         self.goal, self.refuses = serve, refuses
+
+
+class Result(SimpleNamespace):
+    outcome, message = 0, ""
 
 
 @pytest.fixture
@@ -47,14 +52,13 @@ def test_a_goal_accepted_as_the_node_is_deactivated_is_cancelled_at_once(monkeyp
     monkeypatch.setattr(goals, "_require_free", lambda: None)
     cancelled = []
 
-    def work(goal, checked):
+    def work(goal, checked, result):
         cancelled.append(goals.controls.cancelled.is_set())
-        return SimpleNamespace(outcome=0)
 
     async def check(message):
         return "checked"
 
-    goals.act(object, "scan", check, work, 0, None)
+    goals.act(object, "scan", check, work, 0, Result)
     request = SimpleNamespace()
     assert not asyncio.run(node.refuses(request))
     node.active = active
@@ -68,22 +72,51 @@ def test_what_is_asked_of_a_scan_is_refused_while_a_table_is_calibrated(in_this_
     goals = scan_actions.OneGoal(node, contextlib.nullcontext)
     goals.serve_control("scan/pause", lambda controls: controls.paused.set())
 
-    def work(goal, checked):
+    def work(goal, checked, result):
         if goal.request.action == "scan":
             node.control()
         else:
             with pytest.raises(ValueError, match="no scan is running"):
                 node.control()
         paused.append(goals.controls.paused.is_set())
-        return SimpleNamespace(outcome=0)
 
     async def check(message):
         return "checked"
 
     paused = []
     for action in ("scan", "calibrate_table"):
-        goals.act(object, action, check, work, 0, None)
+        goals.act(object, action, check, work, 0, Result)
         request = SimpleNamespace(action=action)
         assert not asyncio.run(node.refuses(request))
         asyncio.run(node.goal(SimpleNamespace(request=request, is_cancel_requested=False)))
     assert paused == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (Interrupted(), "cancelled"),
+        (ScanEnded("the disk is full"), "the disk is full"),
+        (ValueError("points: got 2"), "points: got 2"),
+        (ZeroDivisionError("by zero"), "scan: by zero"),
+    ],
+)
+def test_what_ends_the_work_is_the_message_of_its_result(in_this_thread, error, message):
+    """Also a defect: the result of rclpy's own would tell of a scan that is done."""
+    node, reported = Node(active=True), []
+    failed = lambda what, defect: f"{what}: {defect}"  # noqa: E731
+    node.health = SimpleNamespace(error=reported.append, failed=failed)
+    goals = scan_actions.OneGoal(node, contextlib.nullcontext)
+
+    def work(goal, checked, result):
+        raise error
+
+    async def check(message):
+        return "checked"
+
+    goals.act(object, "scan", check, work, 1, Result)
+    request = SimpleNamespace()
+    assert not asyncio.run(node.refuses(request))
+    goal = SimpleNamespace(request=request, is_cancel_requested=False)
+    assert asyncio.run(node.goal(goal)).message == message
+    assert goals.handle is None
