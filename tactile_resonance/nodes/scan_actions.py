@@ -35,6 +35,8 @@ from tactile_resonance.scan.table_calibration import (
 AT_ONCE_S = 1.0
 """Goals rejected within this time of each other may be of two clients: the reasons of all are reported [s]."""
 OF_ANOTHER = "; of another goal at that time: "
+DONE = CalibrateTable.Result.DONE
+"""Outcome of a goal that has succeeded, of a scan too."""
 RUNNING = "a scan or a calibration is running, cancel it or wait for its result"
 
 
@@ -76,7 +78,6 @@ class OneGoal:
         name: str,
         check: Callable[[Any], Awaitable[Any]],
         work: Callable[[ServerGoalHandle, Any, Any], None],
-        done: int,
         unknown: Callable[[], Any],
     ) -> None:
         """Offer an action.
@@ -90,8 +91,6 @@ class OneGoal:
         work : callable
             Called in a thread with the handle of the goal, what its check has returned and the result, to be
             filled in; what it raises is the result's message.
-        done : int
-            The result's field ``outcome`` of a goal that has succeeded.
         unknown : callable
             Makes the result of a goal of which nothing came.
         """
@@ -141,7 +140,7 @@ class OneGoal:
                     await in_thread(self._node, do, "goal")
             finally:
                 self.handle = self.controls = None
-            end_goal(goal, result.outcome == done)
+            end_goal(goal, result.outcome == DONE)
             return result
 
         self._node.act(kind, name, serve, lambda _: self.cancel(), refuses)

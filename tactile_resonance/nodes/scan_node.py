@@ -112,10 +112,10 @@ class ScanNode(ManagedNode):
         goals = self._goals = OneGoal(self, self._hands.listening)
         for name, ask in CONTROLS.items():
             goals.serve_control(name, ask)
-        done, refused = Scan.Result.COMPLETE, partial(Scan.Result, outcome=Scan.Result.REFUSED)
-        goals.act(Scan, "scan", self._check_scan, self._scan, done, refused)
-        check, done = self._check_calibration, CalibrateTable.Result.DONE
-        goals.act(CalibrateTable, "calibrate_table", check, self._calibrate, done, no_table)
+        refused = partial(Scan.Result, outcome=Scan.Result.REFUSED)
+        goals.act(Scan, "scan", self._check_scan, self._scan, refused)
+        check = self._check_calibration
+        goals.act(CalibrateTable, "calibrate_table", check, self._calibrate, no_table)
 
     def deactivate(self) -> None:
         """End the scan after retracting; its points stay finished."""

@@ -58,7 +58,7 @@ def test_a_goal_accepted_as_the_node_is_deactivated_is_cancelled_at_once(monkeyp
     async def check(message):
         return "checked"
 
-    goals.act(object, "scan", check, work, 0, Result)
+    goals.act(object, "scan", check, work, Result)
     request = SimpleNamespace()
     assert not asyncio.run(node.refuses(request))
     node.active = active
@@ -85,7 +85,7 @@ def test_what_is_asked_of_a_scan_is_refused_while_a_table_is_calibrated(in_this_
 
     paused = []
     for action in ("scan", "calibrate_table"):
-        goals.act(object, action, check, work, 0, Result)
+        goals.act(object, action, check, work, Result)
         request = SimpleNamespace(action=action)
         assert not asyncio.run(node.refuses(request))
         asyncio.run(node.goal(SimpleNamespace(request=request, is_cancel_requested=False)))
@@ -114,7 +114,7 @@ def test_what_ends_the_work_is_the_message_of_its_result(in_this_thread, error, 
     async def check(message):
         return "checked"
 
-    goals.act(object, "scan", check, work, 1, Result)
+    goals.act(object, "scan", check, work, Result)
     request = SimpleNamespace()
     assert not asyncio.run(node.refuses(request))
     goal = SimpleNamespace(request=request, is_cancel_requested=False)
