@@ -136,10 +136,9 @@ def _plant(options: argparse.Namespace) -> Plant:
     from tactile_resonance.contact.payload import Mount
     from tactile_resonance.contact.samples import Pose
     from tactile_resonance.sensor import read_sensor
-    from tactile_resonance.simulation.plant.surfaces import LaidScene
     from tactile_resonance.simulation.plant.tabletop import bench_surface, table_plant
     from tactile_resonance.simulation.tissue.library import read_tissues
-    from tactile_resonance.simulation.tissue.scene import read_scene
+    from tactile_resonance.simulation.tissue.scene import LaidScene, read_scene
 
     library, sensor = read_tissues(), read_sensor()
     how: dict[str, Any] = {"rigid_tip": options.rigid_tip, "mount": Mount(options.mount)}

@@ -45,11 +45,10 @@ from tactile_resonance.recording.messages import (
     time_from_message,
 )
 from tactile_resonance.simulation.plant.defaults import MOST_STEPS, PRIORITY, READY, order
-from tactile_resonance.simulation.plant.surfaces import LaidScene
 from tactile_resonance.simulation.sensor.bench import BenchTip, ContactState, SimulatedBench
 from tactile_resonance.simulation.sensor.bimorph import CoupledBimorph, parts_of
 from tactile_resonance.simulation.tissue.library import read_tissues
-from tactile_resonance.simulation.tissue.scene import PhantomScene
+from tactile_resonance.simulation.tissue.scene import LaidScene, PhantomScene
 from tactile_resonance.srv import ForceOver
 from tactile_resonance.srv import Truth as TruthService
 

@@ -24,13 +24,12 @@ from tactile_resonance.report.run_report import (
     pole_maps_of,
     run_entry,
     scene_name,
-    scene_of,
     warnings_of,
 )
 from tactile_resonance.scan.point_result import PointKind, PointResult
 from tactile_resonance.scan.pole_map import SAME_PLACE_M
 from tactile_resonance.scan.run_content import RunContent
-from tactile_resonance.scan.scene import ScanScene
+from tactile_resonance.scan.scene import ScanScene, scene_of
 
 SIGNIFICANT = 3.0
 """Standard deviations beyond which a difference is counted."""
@@ -112,7 +111,7 @@ def differences(first: RunContent, other: RunContent) -> list[Difference]:
 
 def unlike(first: RunContent, other: RunContent) -> list[str]:
     """What sets the poles of two runs apart beside what was touched: sensor, band, force, nominal contact."""
-    scenes = scene_of(first), scene_of(other)
+    scenes = scene_of(first.path), scene_of(other.path)
     told = []
     for what, value in _CONDITIONS.items():
         one, two = ("unknown" if scene is None else value(scene) for scene in scenes)
@@ -128,7 +127,7 @@ def _contact_text(scene: ScanScene) -> str:
 
 def _nominal(run: RunContent) -> tuple[float, float] | None:
     """Force [N] and age [s] to which the run's poles are referred."""
-    scene = scene_of(run)
+    scene = scene_of(run.path)
     contact = None if scene is None else scene.nominal_contact
     return None if contact is None else (contact.force_n, contact.age_s)
 

@@ -209,7 +209,7 @@ class LiveRun:
     def _surface(self, band: int) -> dict[str, Any]:
         pole_map = self._maps[band].map
         surface = pole_map.surface(_CELLS) if len(pole_map.points) <= MOST_OF_A_MAP else None
-        return map_entry(surface, None)
+        return map_entry(surface)
 
     def _text(self) -> str:
         """What goes on, for people."""

@@ -27,12 +27,11 @@ from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.fields import known
 from tactile_resonance.poles.result import Poles
 from tactile_resonance.recording.messages import array_of, complex_of
-from tactile_resonance.scan.level_set import Lines
+from tactile_resonance.scan.level_set import Boundary, Lines
 from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import HIGH_RGB, LOW_RGB, MapSurface
 
 if TYPE_CHECKING:
-    from tactile_resonance.report.run_map import RunBoundary
     from tactile_resonance.scan.tissue_tests import TissueTest
 
 MM, MN = 1e3, 1e3
@@ -350,8 +349,10 @@ def mechanics_entry(one: TissueTest) -> dict[str, Any]:
     return {**entry, "curve": curve}
 
 
-def map_entry(surface: MapSurface | None, boundary: RunBoundary | None) -> dict[str, Any]:
-    """What lies between the points: kriged natural frequency, and a boundary."""
+def map_entry(
+    surface: MapSurface | None, boundary: Boundary | None = None, true_outline_m: Lines = ()
+) -> dict[str, Any]:
+    """What lies between the points: kriged natural frequency, and a boundary with its simulated truth."""
     entry: dict[str, Any] = {"surface": None, "boundary": None}
     if surface is not None:
         entry["surface"] = {
@@ -361,11 +362,10 @@ def map_entry(surface: MapSurface | None, boundary: RunBoundary | None) -> dict[
             "std_hz": listed(surface.f0_std_hz, 3),
         }
     if boundary is not None:
-        found = boundary.boundary
         entry["boundary"] = {
-            "outline_mm": _lines(found.outline_m),
-            "band_mm": _lines((*found.inner_m, *found.outer_m)),
-            "truth_mm": _lines(boundary.true_outline_m),
+            "outline_mm": _lines(boundary.outline_m),
+            "band_mm": _lines((*boundary.inner_m, *boundary.outer_m)),
+            "truth_mm": _lines(true_outline_m),
         }
     return entry
 

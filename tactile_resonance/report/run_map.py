@@ -31,7 +31,6 @@ from tactile_resonance.fields import counted, known
 from tactile_resonance.poles.result import ellipse
 from tactile_resonance.report.drawing import PROBABILITY, SIMULATED, new_figure
 from tactile_resonance.report.page import MM
-from tactile_resonance.report.run_report import scene_of
 from tactile_resonance.scan.adaptive import Adaptive, known_points
 from tactile_resonance.scan.kriging import LEAST_POINTS
 from tactile_resonance.scan.level_set import PROBABILITY as LINE_PROBABILITY
@@ -54,6 +53,7 @@ from tactile_resonance.scan.pole_map import (
     counts,
 )
 from tactile_resonance.scan.run_content import RunContent, file_of
+from tactile_resonance.scan.scene import scene_of
 from tactile_resonance.simulation.sensor.bench import SimulatedBench
 from tactile_resonance.simulation.sensor.experiments import truth_over
 from tactile_resonance.simulation.tissue.library import read_tissues
@@ -136,7 +136,7 @@ class RunBoundary:
 
 def boundary_of_run(run: RunContent) -> RunBoundary | None:
     """Boundary as far as a run has come; None where none is wanted, or too few points have a pole."""
-    scene = scene_of(run)
+    scene = scene_of(run.path)
     asked = None if scene is None else scene.adaptive
     boundary = None if asked is None else asked.boundary(run.latest)
     if scene is None or asked is None or boundary is None:
@@ -335,7 +335,7 @@ def write_map_recording(run: RunContent) -> Path | None:
         frame_id = _write_frames(writer, run)
         states = min(MOST_STATES, max(1, MOST_DRAWN // len(results)))
         step = -(-len(results) // states)
-        last, scene = GrowingMap(results).map, scene_of(run)
+        last, scene = GrowingMap(results).map, scene_of(run.path)
         names = tuple(name for name in last.classes() if name != UNKNOWN)
         if scene is not None:  # by number as pole_map_node has them, whichever were called
             names = tuple(tissue.name for tissue in scene.tissue_classes)

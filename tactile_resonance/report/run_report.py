@@ -33,7 +33,7 @@ from tactile_resonance.scan.point_result import PointOutcome, PointResult
 from tactile_resonance.scan.pole_map import GrowingMap, PoleMap
 from tactile_resonance.scan.recorded import measurements_of_file
 from tactile_resonance.scan.run_content import RunContent, not_checked
-from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene
+from tactile_resonance.scan.scene import DriftLimits, Output, ScanScene, read_run_scene, scene_of
 from tactile_resonance.scan.tissue_tests import TYPE as TEST_TYPE
 from tactile_resonance.tissue.classify import UNKNOWN
 from tactile_resonance.tones import SilentRecord, silent_record
@@ -54,7 +54,7 @@ def pole_maps_of(run: RunContent) -> list[PoleMap]:
 
     None without a point, or where the scene wants no map.
     """
-    scene = scene_of(run)
+    scene = scene_of(run.path)
     if not run.results or (scene is not None and Output.MAP not in scene.outputs):
         return []
     bands = 1 if scene is None else len(scene.sensor.bands)
@@ -89,7 +89,7 @@ def as_page(
     boundary : RunBoundary, optional
         That was wanted.
     """
-    name, scene = scene_name(run), scene_of(run)
+    name, scene = scene_name(run), scene_of(run.path)
     plan = [] if scene is None else plan_against_outcome(scene, run)
     measured = [result for result in run.latest if result.outcome is PointOutcome.DONE]
     notes = run.facts.get("notes") or {"notes": "none"}
@@ -141,7 +141,7 @@ def run_entry(
     most : int
         Points with details in the page, where there are more than those of this run.
     """
-    scene = scene_of(run)
+    scene = scene_of(run.path)
     bands = [None] if scene is None else scene.sensor.bands
     lines = lines_each(max(most, len(details)))
     return {
@@ -154,7 +154,8 @@ def run_entry(
                 "name": "" if band is None else f"{band.low_hz:g} to {band.high_hz:g} Hz",
                 "points": [point_entry(result.of_band(k)) for result in run.latest],
                 **map_entry(
-                    None if pole_map is None else pole_map.surface(_CELLS), None if k else boundary
+                    None if pole_map is None else pole_map.surface(_CELLS),
+                    *(() if k or boundary is None else (boundary.boundary, boundary.true_outline_m)),
                 ),
             }
             for k, (band, pole_map) in enumerate(zip_longest(bands, pole_maps[: len(bands)]))
@@ -169,8 +170,11 @@ def warnings_of(
     details: Mapping[int, PointDetails] | None = None,
 ) -> list[str]:
     """What a reader must know before any figure of the run, the gravest first."""
-    found, results = _scene_or_reason(run), run.latest
-    scene = None if isinstance(found, str) else found
+    results, scene, unreadable = run.latest, None, ""
+    try:
+        scene = read_run_scene(run.path / "scene.yaml")
+    except ValueError as error:
+        unreadable = str(error)
     told = [f"damaged: {problem}" for problem in run.problems[:_MOST_NAMED]]
     if len(run.problems) > _MOST_NAMED:
         more = counted(len(run.problems) - _MOST_NAMED, "further file is", "further files are")
@@ -182,9 +186,9 @@ def warnings_of(
         told.append(
             f"FRF, force or mechanical tests of {counted(len(unread), 'point')} cannot be read: {unread[0]}"
         )
-    if isinstance(found, str):
+    if unreadable:
         told.append(
-            f"{found}: plan and outcome cannot be compared, further bands are left out, and drift "
+            f"{unreadable}: plan and outcome cannot be compared, further bands are left out, and drift "
             "is judged by the usual limits"
         )
     if len(results) < len(run.points):
@@ -351,7 +355,7 @@ def _compared(run: RunContent, called: Sequence[PointResult]) -> str:
         reasons = "; ".join(sorted({r.tissue_reason for r in called if r.tissue_reason}))
         return f"No pole is referred to a nominal contact: {reasons or 'of an earlier version'}."
     std = np.median([r.nominal_f0_std_hz for r in referred])
-    scene = scene_of(run)
+    scene = scene_of(run.path)
     nominal = scene and scene.nominal_contact
     which = f", {1e3 * nominal.force_n:g} mN and {nominal.age_s:g} s" if nominal else ""
     return (
@@ -368,19 +372,6 @@ def skipped_lines(run: RunContent) -> list[str]:
         saved = f"; saves up to {saved_s:.0f} s" if saved_s else ""
         lines.append(f"{entry['what']}: {entry['why']}{saved}")
     return lines
-
-
-def scene_of(run: RunContent) -> ScanScene | None:
-    """None where it cannot be read: a run is reported whatever became of its scene."""
-    found = _scene_or_reason(run)
-    return None if isinstance(found, str) else found
-
-
-def _scene_or_reason(run: RunContent) -> ScanScene | str:
-    try:
-        return read_run_scene(run.path / "scene.yaml")
-    except ValueError as error:
-        return str(error)
 
 
 def scene_name(run: RunContent) -> str:

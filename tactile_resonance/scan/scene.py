@@ -334,6 +334,14 @@ def read_run_scene(path: Path) -> ScanScene:
     return parse_scan_scene(content, path)
 
 
+def scene_of(run_path: Path) -> ScanScene | None:
+    """Scene of a run; None where it cannot be read: a run is reported whatever became of its scene."""
+    try:
+        return read_run_scene(run_path / "scene.yaml")
+    except ValueError:
+        return None
+
+
 def parse_scan_scene(content: Mapping[str, Any], path: Path) -> ScanScene:
     """Scene of a file's content.
 

@@ -34,8 +34,8 @@ from tactile_resonance.nodes.simulated_tip import MOST_STAYS, Stay, Stays
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import time_from_message
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
-from tactile_resonance.simulation.plant.surfaces import LaidScene
 from tactile_resonance.simulation.sensor.bench import BenchTip, SimulatedBench
+from tactile_resonance.simulation.tissue.scene import LaidScene
 
 SECOND_NS = 10**9
 WITHIN_S = 60.0

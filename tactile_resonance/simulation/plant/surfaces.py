@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What lies on the simulated table: surfaces (flat, a sphere, a hollow), a scene; how living tissue moves."""
+"""What lies on the simulated table: surfaces (flat, a sphere, a hollow); how living tissue moves."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.contact.vectors import Vector, added, dot, scaled, vector
 from tactile_resonance.fields import Checked, Range, Seed, require
-
-if TYPE_CHECKING:
-    from tactile_resonance.contact.samples import Pose
-    from tactile_resonance.simulation.tissue.library import Tissue
-    from tactile_resonance.simulation.tissue.scene import PhantomScene
 
 
 @dataclass(frozen=True)
@@ -129,27 +124,3 @@ class SurfaceMotion(Checked):
         heart += 2 * math.pi * self.heart_hz * time_s
         rise = self.breath_m * math.cos(breath) ** (2 * self.breath_power)
         return rise + self.heart_m / 2 * math.sin(heart)
-
-
-@dataclass(frozen=True)
-class LaidScene:
-    """A scene on the table: its surface, at height 0, and what lies where.
-
-    Attributes
-    ----------
-    scene : PhantomScene
-    table : Pose
-        Frame of the scene in the robot's base.
-    """
-
-    scene: PhantomScene
-    table: Pose
-
-    def surface(self) -> PlantSurface:
-        """The undisturbed surface in the base."""
-        return PlantSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
-
-    def tissue_at(self, position_m: FloatArray) -> Tissue | None:
-        """What the tip touches under a place (3,) in the base."""
-        x, y, _ = self.table.rotation.inv().apply(position_m - self.table.position_m)
-        return self.scene.tissue_at(np.array([x, y, 0.0]))

@@ -19,10 +19,11 @@ from numpy.typing import ArrayLike
 
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.configuration import share_path
+from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import Vector
 from tactile_resonance.fields import AboveZero, Checked, build, read_dataclass, read_yaml, require
 from tactile_resonance.sensor import read_sensor
-from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.tissue.library import (
     GradientEntry,
     HeterogeneityEntry,
@@ -399,3 +400,27 @@ class _BenchPart(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(bool(self.regions), "regions", [], "a list of one region or more")
+
+
+@dataclass(frozen=True)
+class LaidScene:
+    """A scene on the table: its surface, at height 0, and what lies where.
+
+    Attributes
+    ----------
+    scene : PhantomScene
+    table : Pose
+        Frame of the scene in the robot's base.
+    """
+
+    scene: PhantomScene
+    table: Pose
+
+    def surface(self) -> PlantSurface:
+        """The undisturbed surface in the base."""
+        return PlantSurface(self.table.position_m, self.table.rotation.apply([0.0, 0.0, 1.0]))
+
+    def tissue_at(self, position_m: FloatArray) -> Tissue | None:
+        """What the tip touches under a place (3,) in the base."""
+        x, y, _ = self.table.rotation.inv().apply(position_m - self.table.position_m)
+        return self.scene.tissue_at(np.array([x, y, 0.0]))

@@ -8,11 +8,11 @@ from tactile_resonance.configuration import share_path
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.contact.vectors import transform_from_pose
 from tactile_resonance.simulation.plant.plant import Plant
-from tactile_resonance.simulation.plant.surfaces import LaidScene, PlantSurface, SurfaceMotion
+from tactile_resonance.simulation.plant.surfaces import PlantSurface, SurfaceMotion
 from tactile_resonance.simulation.plant.tabletop import move_surface, table_plant
 from tactile_resonance.simulation.plant.tip import Tip
 from tactile_resonance.simulation.tissue.library import Tissue
-from tactile_resonance.simulation.tissue.scene import read_scene
+from tactile_resonance.simulation.tissue.scene import LaidScene, read_scene
 
 RADIUS_M, NU, MODULUS_PA = 2.5e-3, 0.49, 10e3
 BREATH = SurfaceMotion(breath_m=1e-3, breath_hz=0.25)
