@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
+from tactile_resonance.frf.spectra import power
 from tactile_resonance.poles.likelihood import FEWEST_PIECES, TINY, Rules
 from tactile_resonance.poles.noise_level import (
     BINS_PER_BAND,
@@ -241,10 +242,10 @@ def with_noise(
     mean = np.concatenate([_mean_power(rest) * free, variance_u.mean(-1, keepdims=True)], -1)
     kind = np.maximum(kind, np.where(generator[:, 0], 0, kind_u))
     if rows.size:  # an input that is known but for the noise of its voltmeter, which the response brings in
-        sample, gain = (_power(x[rows]).reshape(rows.size, -1, records).mean(-1) for x in (rest, response))
+        sample, gain = (power(x[rows]).reshape(rows.size, -1, records).mean(-1) for x in (rest, response))
         curve, kind[rows] = smooth_variance(sample * free, gain, Pieces.of(data.undriven, pieces.size, records))
         flat, channels = kind[rows, None] == 0, channels_of(curve, gain)
-        driven = channels[:, :1] + channels[:, 1:] * _power(problem.response(theta[rows, 0]))
+        driven = channels[:, :1] + channels[:, 1:] * power(problem.response(theta[rows, 0]))
         of_rest = np.tile(of_rest, (1, data.undriven // of_rest.shape[1]))
         of_y = np.tile(of_y, (1, data.driven // of_y.shape[1]))
         of_rest[rows], of_y[rows] = curve, np.where(flat, driven, curve[:, beside])
@@ -307,15 +308,11 @@ def _powers(
 def _by_piece(values: ComplexArray, pieces: Pieces, factor: float) -> tuple[FloatArray, IntArray]:
     """(batch, 1) or (batch, pieces) variance, flat unless a test says otherwise, and its kind in `KINDS`."""
     mean = _mean_power(values) * factor
-    samples = pieces.means(_power(values))
+    samples = pieces.means(power(values))
     if pieces.starts.size < FEWEST_PIECES or bool(are_flat(samples, pieces.dof).all()):
         return mean, np.zeros(mean.shape[0], np.int64)
     model = model_variance(samples * factor, pieces.dof)
     return np.where(model.kind[:, None] == 0, mean, model.variance), model.kind
-
-
-def _power(values: ComplexArray) -> FloatArray:
-    return np.asarray(values.real**2 + values.imag**2)
 
 
 def _mean_power(values: ComplexArray) -> FloatArray:

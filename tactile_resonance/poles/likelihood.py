@@ -22,7 +22,6 @@ for all of them; each goes its own way.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -172,11 +171,6 @@ class Solution(NamedTuple):
     def rows(self, which: npt.NDArray) -> Solution:
         """Some of the points."""
         return Solution._make(x[which] if len(x) else x for x in self)
-
-    @classmethod
-    def joined(cls, solutions: Sequence[Solution]) -> Solution:
-        """Of the points of all."""
-        return cls(*(np.concatenate(arrays) for arrays in zip(*solutions, strict=True)))
 
     def put(self, which: npt.NDArray, others: Solution) -> None:
         """Write other solutions in place of some; what undriven bins show stays as it was found."""

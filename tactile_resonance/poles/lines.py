@@ -465,8 +465,8 @@ class LinesPlan(FitPlan):
 
     def _fit_dense(self, data: BinData) -> tuple[LinesPlan, Solution]:
         """Point by point."""
-        rows = (data.rows(slice(k, k + 1)) for k in range(len(data.y)))
-        return self, Solution.joined([self._best_of_starts(row) for row in rows])
+        each = [self._best_of_starts(data.rows(slice(k, k + 1))) for k in range(len(data.y))]
+        return self, Solution(*map(np.concatenate, zip(*each, strict=True)))
 
     def _best_of_starts(self, row: BinData) -> Solution:
         """Of several starts the one with the least cost."""

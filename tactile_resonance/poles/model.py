@@ -140,9 +140,8 @@ def _two_roots(coefficients, h, roots):
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """The variable x of the polynomials: ``s / scale`` or ``z``."""
+    """The variable x of the polynomials: ``s / scale``, or ``z`` where there is a sample rate."""
 
-    domain: str
     scale_rad_s: float
     sample_rate_hz: float | None = None
 
@@ -150,7 +149,7 @@ class Variable:
     def for_lines(cls, frequency_hz: FloatArray, structure: ModelStructure) -> Variable:
         """Scaled to the highest line."""
         scale = 2 * np.pi * float(np.max(frequency_hz))
-        return cls(structure.domain, scale if scale > 0 else 1.0, structure.sample_rate_hz)
+        return cls(scale if scale > 0 else 1.0, structure.sample_rate_hz if structure.domain == "z" else None)
 
     def of_frequency(self, frequency_hz: FloatArray) -> ComplexArray:
         """The x of lines [Hz]."""
@@ -158,20 +157,20 @@ class Variable:
 
     def of_s(self, s_rad_s: ComplexArray) -> ComplexArray:
         """The x of points of the s-plane."""
-        if self.sample_rate_hz is not None and self.domain == "z":
+        if self.sample_rate_hz is not None:
             return np.asarray(np.exp(s_rad_s / self.sample_rate_hz))
         return s_rad_s / self.scale_rad_s
 
     def to_s(self, x: ComplexArray) -> ComplexArray:
         """The s [rad/s] of x."""
-        if self.sample_rate_hz is not None and self.domain == "z":
+        if self.sample_rate_hz is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
                 return np.asarray(self.sample_rate_hz * np.log(x), complex)
         return np.asarray(x * self.scale_rad_s, complex)
 
     def slope(self, x: ComplexArray) -> ComplexArray:
         """The derivative ds/dx [rad/s]."""
-        if self.sample_rate_hz is not None and self.domain == "z":
+        if self.sample_rate_hz is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
                 return np.asarray(self.sample_rate_hz / x)
         return np.full(x.shape, self.scale_rad_s, complex)
@@ -273,7 +272,7 @@ class RationalModel:
         b_values, b_slopes = self.numerator_basis.at(x)
         b, b1 = _dot(b_values, self.numerator), _dot(b_slopes, self.numerator)
         map_1 = self.variable.slope(x)
-        map_2 = -map_1 / x if self.variable.domain == "z" else np.zeros_like(map_1)
+        map_2 = -map_1 / x if self.variable.sample_rate_hz is not None else np.zeros_like(map_1)
         dx = -values[..., :-1] / a1[..., None]
         residue = b / a1
         by_x = (b1 - residue * a2) / a1 * map_1 + residue * map_2
