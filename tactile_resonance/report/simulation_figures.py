@@ -31,7 +31,7 @@ def draw_tissues(bench: SimulatedBench, library: TissueLibrary, names: Sequence[
     shape = mode_shape(modes.eigenvalues, x) * scale[:, None]
     for n in range(5):
         label = f"mode {n + 1}, {modes.natural_rad_s[n] / (2 * np.pi):.1f} Hz"
-        shapes.plot(1e3 * x * modes.length_m, shape[n], label=label)
+        shapes.plot(1e3 * x * bench.sensor.beam.free_length_m, shape[n], label=label)
     shapes.set(
         xlabel="position on the beam [mm]",
         ylabel="mass-normalised [kg^-1/2]",

@@ -52,34 +52,23 @@ class BeamModes:
         Modal damping ratio, the same for all modes.
     tip_deflection : (n,) array
         Mass-normalised mode shapes at the tip [kg^-1/2].
-    tip_slope : (n,) array
-        Their slopes at the tip [kg^-1/2 m^-1].
     coupling : (n,) array
-        ``chi_i = theta * tip_slope_i`` [N kg^-1/2 / V]: modal force per volt.
+        ``chi_i = theta slope_i`` [N kg^-1/2 / V]: modal force per volt, of the slope of a mode at the tip.
     capacitance_f : float
         Total capacitance ``Ct = Cp + Cs`` across the sensing layer [F], Cp clamped.
     eigenvalues : (n,) array
         Roots beta of the frequency equation, ``natural = (beta / L)^2 sqrt(EI / m)``.
-    bending_stiffness_nm2 : float
-        EI [N m^2].
-    length_m : float
-        Free length [m].
+    static_stiffness_n_per_m : float
+        Of the whole beam at the tip, ``3 EI / L^3``.
     """
 
     natural_rad_s: FloatArray
     damping_ratio: float
     tip_deflection: FloatArray
-    tip_slope: FloatArray
     coupling: FloatArray
     capacitance_f: float
     eigenvalues: FloatArray
-    bending_stiffness_nm2: float
-    length_m: float
-
-    @property
-    def static_stiffness_n_per_m(self) -> float:
-        """Stiffness of the whole beam at the tip, ``3 EI / L^3`` [N/m]."""
-        return 3 * self.bending_stiffness_nm2 / self.length_m**3
+    static_stiffness_n_per_m: float
 
     @property
     def spring(self) -> tuple[float, float, float]:
@@ -127,12 +116,10 @@ def sensor_modes(sensor: SensorParameters) -> BeamModes:
         natural_rad_s=(beta / length) ** 2 * np.sqrt(stiffness / line_mass),
         damping_ratio=beam.modal_damping_ratio,
         tip_deflection=deflection,
-        tip_slope=slope,
         coupling=moment * slope,
         capacitance_f=clamped_f / (1 - sensor.electric.feedthrough),
         eigenvalues=beta,
-        bending_stiffness_nm2=stiffness,
-        length_m=length,
+        static_stiffness_n_per_m=3 * stiffness / length**3,
     )
 
 

@@ -238,12 +238,13 @@ def test_modal_frequencies_are_roots_of_the_transcendental_equation(sensor):
     modes = sensor_modes(sensor)
     beam = sensor.beam
     line_mass, length = mass_per_length(beam), beam.free_length_m
+    bending_nm2 = modes.static_stiffness_n_per_m * length**3 / 3
     mu = mpmath.mpf(sensor.tip.mass_kg) / (line_mass * length)
     for natural in modes.natural_rad_s:
         values = []
         for factor in (1 - 1e-6, 1 + 1e-6):
             # beta from the frequency by the beam's dispersion
-            ratio = natural * factor * np.sqrt(line_mass / modes.bending_stiffness_nm2)
+            ratio = natural * factor * np.sqrt(line_mass / bending_nm2)
             b = mpmath.mpf(np.sqrt(ratio) * length)
             inertia = mu * b * (mpmath.cos(b) * mpmath.sinh(b) - mpmath.sin(b) * mpmath.cosh(b))
             values.append(1 + mpmath.cos(b) * mpmath.cosh(b) + inertia)
@@ -273,11 +274,14 @@ def test_modes_are_orthonormal_in_mass_with_the_tip(sensor):
 def test_modal_sums_give_static_deflection_and_slope(sensor):
     many = replace(sensor, beam=replace(sensor.beam, mode_count=40))
     modes = sensor_modes(many)
-    length, stiffness = modes.length_m, modes.bending_stiffness_nm2
+    length, stiffness = many.beam.free_length_m, modes.static_stiffness_n_per_m
     compliance = np.sum(modes.tip_deflection**2 / modes.natural_rad_s**2)
-    assert compliance == pytest.approx(length**3 / (3 * stiffness), rel=1e-6)
-    slope = np.sum(modes.tip_deflection * modes.tip_slope / modes.natural_rad_s**2)
-    assert slope == pytest.approx(length**2 / (2 * stiffness), rel=1e-4)
+    assert compliance == pytest.approx(1 / stiffness, rel=1e-6)
+    # theta of `sensor_modes` [N m / V]
+    arm_m = (many.beam.piezo_thickness_m + many.beam.shim_thickness_m) / 2
+    theta = -many.beam.d31_m_per_v * many.beam.piezo_modulus_pa * many.beam.width_m * arm_m
+    slope = np.sum(modes.tip_deflection * modes.coupling / theta / modes.natural_rad_s**2)
+    assert slope == pytest.approx(3 / (2 * length * stiffness), rel=1e-4)
 
 
 def test_static_stiffness_is_the_published_one(sensor):
