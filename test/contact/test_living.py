@@ -16,7 +16,7 @@ from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.pressing import HeldMotion
 from tactile_resonance.sensor import read_sensor
 from tactile_resonance.simulation.plant.surfaces import SurfaceMotion
-from tactile_resonance.simulation.plant.tip import OnSoft, RigidTip, Tip, bone, clinging
+from tactile_resonance.simulation.plant.tip import OnSoft, Tip, bone, clinging
 from tactile_resonance.simulation.sensor.bimorph import sensor_modes
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -103,9 +103,7 @@ def test_where_one_pressed_too_hard_the_next_touch_is_slow_again():
     assert is_known(controller, made.goal)
     harder = ContactGoal(made.goal.touch, 0.018)
     assert not is_known(controller, harder)  # as deep as that nobody has been
-    made.bench.plant._on = RigidTip(
-        OnSoft(made.bench.plant._on.indenter, bone(1e-4, RADIUS_M))
-    )
+    made.bench.plant._on = (OnSoft(made.bench.plant._on[0], bone(1e-4, RADIUS_M)),) * 2
     made.loop.make(made.goal)
     made.run_until(State.IDLE, 5.0)
     assert controller.result.cause in (Cause.FORCE_ABORT, Cause.FORCE_RATE, Cause.FORCE_HARD)
@@ -120,9 +118,9 @@ def test_place_is_forgotten_when_pressed_too_hard_whatever_becomes_of_the_tip():
     controller = made.controller
     assert is_known(controller, made.goal)
     # bone below, and a hook that holds the tip when it is drawn back: `held` is the cause in the end
-    on_bone = OnSoft(made.bench.plant._on.indenter, bone(1e-4, RADIUS_M))
+    on_bone = OnSoft(made.bench.plant._on[0], bone(1e-4, RADIUS_M))
     hook = clinging(lambda height_m, _: 40.0 * height_m)
-    made.bench.plant._on = RigidTip(OnSoft(on_bone, hook))
+    made.bench.plant._on = (OnSoft(on_bone, hook),) * 2
     made.loop.make(made.goal)
     made.run_until(State.IDLE, 4.0)
     assert controller.state is State.FAULT

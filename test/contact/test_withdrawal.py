@@ -11,7 +11,7 @@ import pytest
 from tactile_resonance.contact.goal import Cause, State
 from tactile_resonance.contact.parameters import Limits, Workspace
 from tactile_resonance.simulation.plant.surfaces import PlantSurface
-from tactile_resonance.simulation.plant.tip import OnSoft, RigidTip, clinging
+from tactile_resonance.simulation.plant.tip import OnSoft, clinging
 
 sys.path.insert(0, str(Path(__file__).parent))
 from contacts import QUICK, RADIUS_M, SOFT, contact, started, stiffer
@@ -23,9 +23,9 @@ def held_by(pull):
     made = started()
     assert made.run_until(State.HOLD)
     plant = made.bench.plant
-    held = OnSoft(plant._on.indenter, clinging(pull))
+    held = OnSoft(plant._on[0], clinging(pull))
     held._touched = True
-    plant._on = RigidTip(held)
+    plant._on = held, held
     made.controller.retract()
     made.run_until(State.IDLE, 4.0)
     return made, held

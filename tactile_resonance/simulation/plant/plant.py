@@ -156,10 +156,11 @@ class Plant:
         pushed = held = 0.0
         self._find_tissue(place, height, normal, way)
         if self._on is not None:
-            held = self._on.step(depth, dt_s)
-            pushed = self._on.indenter.force_n
-            self.depth_m = max(0.0, self._on.indenter.depth_m)
-            self.contact_radius_m = self._on.indenter.contact_radius_m
+            ball, moved = self._on
+            held = moved.step(depth, dt_s)
+            pushed = ball.force_n
+            self.depth_m = max(0.0, ball.depth_m)
+            self.contact_radius_m = ball.contact_radius_m
         else:
             self.depth_m = self.contact_radius_m = 0.0
         touching = pushed > 0

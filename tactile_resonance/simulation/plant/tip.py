@@ -135,17 +135,6 @@ TURN_RAD = 0.2
 """Of a swing in a sub-step, at most, on what is the stiffer the deeper it is."""
 
 
-@dataclass(frozen=True)
-class RigidTip:
-    """A ball that moves as the robot does."""
-
-    indenter: Ball
-
-    def step(self, depth_m: float, dt_s: float) -> float:
-        """Advance with the depth of the ball [m]; return the force on it [N]."""
-        return self.indenter.step(depth_m, dt_s)
-
-
 class SprungIndenter:
     """An indenter at the end of the beam: static stiffness and first mode between base and tip.
 
@@ -197,8 +186,9 @@ class SprungIndenter:
         return self.force_n
 
 
-TipOnTissue = RigidTip | SprungIndenter
-"""A tip on one tissue through time: `step` takes the depth of what holds it, and returns the force on that."""
+TipOnTissue = tuple[Ball, Ball | SprungIndenter]
+"""The ball on one tissue, and what is moved: itself, or its beam. `step` of that takes its depth, and returns
+the force on it."""
 
 
 @dataclass(frozen=True)
@@ -234,4 +224,4 @@ class Tip:
             adhesion_j_per_m2=self.adhesion_j_per_m2,
         )
         ball: Ball = soft if self.meets is None else self.meets(soft)
-        return RigidTip(ball) if self.beam is None else SprungIndenter(ball, self.beam.spring)
+        return ball, ball if self.beam is None else SprungIndenter(ball, self.beam.spring)
