@@ -37,8 +37,8 @@ from tactile_resonance.report.page import (
     point_entry,
 )
 from tactile_resonance.report.point_details import MOST_DETAILED, PointDetails
-from tactile_resonance.scan.point_result import PointKind, PointOutcome, PointResult, mode_columns
-from tactile_resonance.scan.pole_map import GrowingMap
+from tactile_resonance.scan.point_result import PointOutcome, PointResult, mode_columns
+from tactile_resonance.scan.pole_map import GrowingMap, counts
 
 Publish = Callable[[str, Any], None]
 HOLDING = "hold"  # state of a contact in which is measured
@@ -112,7 +112,7 @@ class LiveRun:
 
     def take_result(self, result: PointResult, poles: Poles | None) -> None:
         """One attempt at a point; what is discarded, or measured in air, is not shown."""
-        if result.kind is not PointKind.TISSUE or result.outcome is PointOutcome.DISCARDED:
+        if not counts(result):
             return
         with self._lock:
             before = self._results.get(result.index)
@@ -186,8 +186,8 @@ class LiveRun:
                 r.failed and r.outcome is not PointOutcome.SKIPPED for r in self._results.values()
             )
             simulated = any(r.simulated for r in self._results.values())
-            counts = {"points": len(self._results), "failed": failed, "simulated": simulated}
-            self._publish("now", {"text": self._text(), "forces": forces, **counts})
+            so_far = {"points": len(self._results), "failed": failed, "simulated": simulated}
+            self._publish("now", {"text": self._text(), "forces": forces, **so_far})
             if self._is_new:
                 self._is_new = False
                 self._publish(

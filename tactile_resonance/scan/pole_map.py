@@ -304,10 +304,7 @@ class GrowingMap:
 
     def _remove(self, point: MapPoint) -> None:
         del self._points[point]
-        at = self._at[_cell(point.result)]
-        at.remove(point)
-        if not at:
-            del self._at[_cell(point.result)]
+        self._at[_cell(point.result)].remove(point)
         if self._of_measurement.get(point.result.measurement_id) is point:
             del self._of_measurement[point.result.measurement_id]
         self._map = None
