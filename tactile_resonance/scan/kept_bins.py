@@ -234,7 +234,7 @@ def write_bins(
         return KeptBins((), tuple(left_out))
     waiting: dict[BinsKind, list[npt.NDArray]] = {}  # in the order in which kinds came first
     pieces: dict[BinsKind, list[tuple[str, int]]] = {}  # name and rows of each
-    with whole_npz(folder / NAME) as members:
+    with whole_files(folder / NAME) as (growing,), zipfile.ZipFile(growing, "w") as members:
 
         def write(kind: BinsKind) -> None:
             rows, of_kind = np.concatenate(waiting[kind]), pieces.setdefault(kind, [])
@@ -298,14 +298,7 @@ def whole_files(*paths: Path) -> Iterator[list[IO[bytes]]]:
                 part.unlink(missing_ok=True)
 
 
-@contextlib.contextmanager
-def whole_npz(path: Path) -> Iterator[zipfile.ZipFile]:
-    """An ``.npz`` file to be written array by array; see `whole_files`."""
-    with whole_files(path) as (growing,), zipfile.ZipFile(growing, "w") as members:
-        yield members
-
-
 def write_array(members: zipfile.ZipFile, name: str, array: npt.NDArray) -> None:
-    """Add an array to an ``.npz`` file."""
+    """Add an array to an ``.npz`` file that is written array by array."""
     with members.open(f"{name}.npy", "w", force_zip64=True) as member:
         np.lib.format.write_array(member, array, allow_pickle=False)

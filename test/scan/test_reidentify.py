@@ -23,7 +23,7 @@ import pytest
 from tactile_resonance.cli import main
 from tactile_resonance.poles.structure import ModelStructure
 from tactile_resonance.scan import kept_bins, reidentify
-from tactile_resonance.scan.kept_bins import whole_files, whole_npz, write_array
+from tactile_resonance.scan.kept_bins import whole_files, write_array
 from tactile_resonance.scan.messages import to_cdr
 from tactile_resonance.scan.run_directory import RunDirectory
 
@@ -437,11 +437,12 @@ def test_an_interrupted_one_leaves_what_was_there(runs, tmp_path):
 def test_an_unfinished_file_is_none(tmp_path):
     path, rows = tmp_path / "rows.npz", np.zeros(10, [("a", "<i4"), ("b", "<c8", (2, 3))])
     rows["a"], rows["b"] = np.arange(10), 1j
-    with contextlib.suppress(KeyError), whole_npz(path) as members:
-        write_array(members, "x", rows)
+    with contextlib.suppress(KeyError), whole_files(path) as (file,):
+        with zipfile.ZipFile(file, "w") as members:
+            write_array(members, "x", rows)
         raise KeyError
     assert not list(tmp_path.iterdir())
-    with whole_npz(path) as members:
+    with whole_files(path) as (file,), zipfile.ZipFile(file, "w") as members:
         write_array(members, "x", rows)
         write_array(members, "more", np.array("text"))
         assert not list(tmp_path.iterdir())
