@@ -213,20 +213,20 @@ def answer_of(
         As that of `Goals`.
     """
     asked: list[Future] = []
-    asked_s, deadline_s = -math.inf, time.monotonic() + within_s
-    while (answer := next((each for each in asked if each.done()), None)) is None:
-        check()
-        now_s = time.monotonic()
-        if now_s > deadline_s:
-            break
-        if now_s - asked_s > ASK_AGAIN_S and service.service_is_ready():
+    asked_s = -math.inf
+
+    def answered() -> bool:
+        nonlocal asked_s
+        if time.monotonic() - asked_s > ASK_AGAIN_S and service.service_is_ready():
             asked.append(service.call_async(request))
-            asked_s = now_s
-        pause(POLL_S)
+            asked_s = time.monotonic()
+        return any(each.done() for each in asked)
+
+    wait_for(answered, within_s, check, pause)
     for each in asked:
         if not each.done():
             service.remove_pending_request(each)
-    return None if answer is None else answer.result()
+    return next((each.result() for each in asked if each.done()), None)
 
 
 def offer(

@@ -7,7 +7,6 @@ import threading
 from collections import deque
 
 from geometry_msgs.msg import WrenchStamped
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from tactile_resonance.clock import Clock, WallClock
@@ -82,11 +81,7 @@ class TopicWrench:
         self._listening = True
         if self._subscription is None:
             self._subscription = self._node.create_subscription(
-                WrenchStamped,
-                self._config.topic,
-                self._on_wrench,
-                SERIES,
-                callback_group=MutuallyExclusiveCallbackGroup(),
+                WrenchStamped, self._config.topic, self._on_wrench, SERIES
             )
 
     def read(self) -> list[CellSample]:
