@@ -16,8 +16,7 @@ from tactile_resonance.action import Measure
 from benchmarks.scan_session import ScanSession
 from tactile_resonance import msg
 from tactile_resonance._typing import FloatArray, IntArray
-from tactile_resonance.nodes.diagnostics import LONGEST, MEAN, PERIOD_S
-from tactile_resonance.nodes.running import RESULTS
+from tactile_resonance.nodes.running import LONGEST, MEAN, PERIOD_S, RESULTS
 from tactile_resonance.recording.messages import record_from_message
 
 TOPICS = {"bench/block": msg.Record, "record": msg.Record, "frf": msg.FRF, "poles": msg.Poles}

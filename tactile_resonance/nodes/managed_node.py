@@ -31,9 +31,8 @@ from std_srvs.srv import Trigger
 from tactile_resonance import msg
 from tactile_resonance.contact.interfaces import ArmError, ForceError
 from tactile_resonance.drivers.acquisition import DeviceError
-from tactile_resonance.nodes.diagnostics import Health
 from tactile_resonance.nodes.parameters import Fixed, Parameter, declare, values
-from tactile_resonance.nodes.running import BEATS, STEADY, RCLError, run_node
+from tactile_resonance.nodes.running import BEATS, STEADY, Health, RCLError, run_node
 
 # What a configuration or a request may be refused with; anything else is a defect and keeps its traceback.
 REFUSALS = (ValueError, OSError, DeviceError, ArmError, ForceError, ParameterException)

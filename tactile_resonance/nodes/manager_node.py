@@ -15,9 +15,8 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from tactile_resonance.nodes.diagnostics import Health
 from tactile_resonance.nodes.parameters import Fixed, Parameter, declare, values
-from tactile_resonance.nodes.running import STEADY, run_node
+from tactile_resonance.nodes.running import STEADY, Health, run_node
 
 STREAM_NODES = ["excitation_node", "frf_node", "poles_node"]
 

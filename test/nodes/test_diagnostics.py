@@ -13,8 +13,14 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from tactile_resonance.bringup import NODES
 from tactile_resonance.configuration import share_path
-from tactile_resonance.nodes.diagnostics import ERROR_REMEMBERED_S, LONGEST, MEAN, PERIOD_S, Health
-from tactile_resonance.nodes.running import initialised
+from tactile_resonance.nodes.running import (
+    ERROR_REMEMBERED_S,
+    LONGEST,
+    MEAN,
+    PERIOD_S,
+    Health,
+    initialised,
+)
 from tactile_resonance.processes import free_domain_id
 
 
