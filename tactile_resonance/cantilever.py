@@ -8,8 +8,8 @@ inertia of the tip.
 from __future__ import annotations
 
 import numpy as np
+import scipy  # its parts are loaded where they are used first: scipy.optimize takes a node 0.15 s
 from scipy import special
-from scipy.optimize import brentq, least_squares
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.calibration.model import Calibration
@@ -51,7 +51,7 @@ def cantilever_eigenvalues(mass_ratio: float, count: int) -> FloatArray:
     if mass_ratio < 0:
         raise ValueError(f"mass_ratio: got {mass_ratio!r}; accepted is 0 or above")
     roots = [
-        brentq(frequency_equation, n * np.pi, (n + 1) * np.pi, args=(mass_ratio,), xtol=1e-15)
+        scipy.optimize.brentq(frequency_equation, n * np.pi, (n + 1) * np.pi, args=(mass_ratio,), xtol=1e-15)
         for n in range(count)
     ]
     return np.array(roots)
@@ -129,7 +129,7 @@ def tip_mass(calibration: Calibration) -> tuple[float, float, str]:
 
     # a bare cantilever's shapes are 2 at the tip, of a mass of 1
     start = [np.log(values[0] / 3.5), -2 * np.log(values[known.size] / 2), np.log(0.05)]
-    found = least_squares(residual, start, diff_step=1e-6, bounds=([-50, -50, -12], 50))
+    found = scipy.optimize.least_squares(residual, start, diff_step=1e-6, bounds=([-50, -50, -12], 50))
     chance = float(special.chdtrc(values.size - 3, 2 * found.cost))
     if chance < CONTRADICTED:
         return nan, nan, "the modes are not those of a uniform cantilever with a point mass"

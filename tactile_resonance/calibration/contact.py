@@ -17,7 +17,7 @@ from enum import Enum
 from functools import lru_cache
 
 import numpy as np
-from scipy import optimize
+import scipy  # its parts are loaded where they are used first: scipy.optimize takes a node 0.15 s
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.calibration.model import ContactStiffness
@@ -147,7 +147,7 @@ def _power_table() -> tuple[FloatArray, FloatArray]:
         weight = 1 / np.abs(wanted)
         a, b = basis * weight[:, None], wanted * weight
         real = np.concatenate([a.real, a.imag]), np.concatenate([b.real, b.imag])
-        rows.append(optimize.nnls(*real, maxiter=1000)[0])
+        rows.append(scipy.optimize.nnls(*real, maxiter=1000)[0])
     return grid, np.array(rows)
 
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
+import scipy  # its parts are loaded where they are used first: scipy.optimize takes a node 0.15 s
 from scipy import special
 from scipy.ndimage import median_filter
-from scipy.optimize import minimize_scalar
 
 from tactile_resonance._typing import BoolArray, ComplexArray, FloatArray, IntArray
 from tactile_resonance.frf.result import FRF
@@ -333,7 +333,7 @@ def _tone_near(
         phasor = values @ shape.conj() / np.sum(np.abs(shape) ** 2)
         return float(np.sum(np.abs(values - phasor[:, None] * shape) ** 2)), phasor
 
-    found = minimize_scalar(
+    found = scipy.optimize.minimize_scalar(
         lambda at: fit(at)[0], bounds=(k - 0.7, k + 0.7), method="bounded", options={"xatol": 1e-4}
     )
     return float(found.x), fit(float(found.x))[1]

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import scipy  # its parts are loaded where they are used first: scipy.optimize takes a node 0.15 s
 from scipy.linalg import cholesky, eigh, lapack, solve_triangular
-from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist, pdist
 
@@ -278,10 +278,8 @@ def _fitted(
         return sum(_cost(x, *part) for part in parts)
 
     bounds = [lengths, sizes, scatters]
-    found = (
-        minimize(cost, np.array([start, size, first]), method="L-BFGS-B", bounds=bounds)
-        for start in starts
-    )
+    minimize = partial(scipy.optimize.minimize, method="L-BFGS-B", bounds=bounds)
+    found = (minimize(cost, np.array([start, size, first])) for start in starts)
     return np.exp(min(found, key=lambda each: each.fun).x)
 
 

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import griddata
+import scipy  # its parts are loaded where they are used first
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -243,8 +243,8 @@ class PoleMap:
         x, y = (np.linspace(low[k], high[k], counts[k] + 1) for k in range(2))
         xy = np.stack(np.meshgrid(x, y), axis=-1)  # (r, c, 2)
         value, std = kriged.predict(xy)
-        z = griddata(known, heights, xy, method="linear")
-        z = np.where(np.isnan(z), griddata(known, heights, xy, method="nearest"), z)
+        z = scipy.interpolate.griddata(known, heights, xy, method="linear")
+        z = np.where(np.isnan(z), scipy.interpolate.griddata(known, heights, xy, method="nearest"), z)
         return MapSurface(np.concatenate([xy, z[..., None]], axis=-1), value, std)
 
 

@@ -13,8 +13,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import RectBivariateSpline
-from scipy.sparse import csr_array
+import scipy  # its parts are loaded where they are used first
 
 from tactile_resonance._typing import BoolArray, FloatArray, IntArray
 from tactile_resonance.array_files import read_arrays
@@ -122,14 +121,14 @@ class HeightField(Surface):
         return (x >= self.x_m[0]) & (x <= self.x_m[-1]) & (y >= self.y_m[0]) & (y <= self.y_m[-1])
 
     @cached_property
-    def _spline(self) -> RectBivariateSpline:
+    def _spline(self) -> scipy.interpolate.RectBivariateSpline:
         x, y, z = self.x_m, self.y_m, self.z_m
         # a spline of order 1 has no slope in scipy: the middle of two makes it one of order 2
         if x.size == 2:
             x, z = np.insert(x, 1, x.mean()), np.insert(z, 1, z.mean(axis=0), axis=0)
         if y.size == 2:
             y, z = np.insert(y, 1, y.mean()), np.insert(z, 1, z.mean(axis=1), axis=1)
-        return RectBivariateSpline(x, y, z, kx=min(3, x.size - 1), ky=min(3, y.size - 1))
+        return scipy.interpolate.RectBivariateSpline(x, y, z, kx=min(3, x.size - 1), ky=min(3, y.size - 1))
 
 
 def unit_normal(slope_x: npt.ArrayLike, slope_y: npt.ArrayLike) -> FloatArray:
@@ -226,12 +225,13 @@ class TriangleMesh(Surface):
 def _corner_normals(faces: IntArray, normals: FloatArray, angles_rad: FloatArray) -> FloatArray:
     """(t, 3, 3) unit normals at the corners of faces (t, 3) with normals (t, 3) and angles (t, 3)."""
     count = faces.size
-    at = csr_array((np.ones(count), (np.arange(count), faces.ravel())))  # (3 t, c)
+    at = scipy.sparse.csr_array((np.ones(count), (np.arange(count), faces.ravel())))  # (3 t, c)
     pairs = (at @ at.T).tocoo()  # corners of faces at one place
     one, other = normals[pairs.row // 3], normals[pairs.col // 3]
     # a face too thin to have a normal takes those of all
     alike = np.sum(one * other, axis=1) >= math.cos(EDGE_RAD) * np.sum(one * one, axis=1)
-    weights = csr_array((angles_rad.ravel()[pairs.col] * alike, (pairs.row, pairs.col)), shape=pairs.shape)
+    shares = angles_rad.ravel()[pairs.col] * alike
+    weights = scipy.sparse.csr_array((shares, (pairs.row, pairs.col)), shape=pairs.shape)
     summed = weights @ np.repeat(normals, 3, axis=0)
     length = np.linalg.norm(summed, axis=1, keepdims=True)
     return np.asarray(summed / np.where(length > 0, length, 1.0)).reshape(-1, 3, 3)

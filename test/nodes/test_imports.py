@@ -15,7 +15,7 @@ HARDWARE = (
 )
 """All nodes but the simulated bench."""
 STREAM = ("frf_node", "poles_node", "excitation_node", "contact_node", "manager_node", "scan_node")
-HEAVY = ("scipy.stats", "matplotlib", "numba")
+HEAVY = ("scipy.stats", "scipy.optimize", "scipy.interpolate", "matplotlib", "numba")
 COMPILED = ("poles_node", "contact_node")
 """What numba compiles: fits of poles, the filter of the control loop."""
 LOADED = """
@@ -58,4 +58,4 @@ def test_what_plays_and_measures_loads_nothing_of_scenes_and_runs():
 def test_the_bench_loads_nothing_of_the_robot_that_it_starts():
     found = loaded_by(("fake_hardware_node",))
     assert "tactile_resonance.simulation.sensor.bench" in found
-    assert found.isdisjoint({"numba", "tactile_resonance.simulation.plant.simulated_robot"})
+    assert found.isdisjoint({*HEAVY, "scipy.spatial", "tactile_resonance.simulation.plant.simulated_robot"})

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its parts are loaded where they are used first
 
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.clock import Clock, Demand
@@ -95,7 +95,8 @@ class TipMotion:
         # the same object where nothing turns, so that what is computed from it can be kept
         rotation = self.reported.rotation_rad
         if way[3] or way[4] or way[5]:
-            rotation = (Rotation.from_rotvec(way[3:]) * self.reported.rotation).as_rotvec()
+            turn = scipy.spatial.transform.Rotation.from_rotvec(way[3:])
+            rotation = (turn * self.reported.rotation).as_rotvec()
         self.reported = Pose(self.reported.position_m + way[:3], rotation)
         self.pose = Pose(self.reported.position_m + self._jitter.step(), rotation)
 
