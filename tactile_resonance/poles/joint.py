@@ -88,7 +88,8 @@ class JointPlan(FitPlan):
     def __post_init__(self) -> None:
         for name in ("samples_per_period", "periods"):
             value = getattr(self, name)
-            require(isinstance(value, Integral) and value >= 1, name, value, "a whole number, at least 1")
+            good = isinstance(value, Integral) and int(value) >= 1
+            require(good, name, value, "a whole number, at least 1")
         rate_hz = number(self.sample_rate_hz, "sample_rate_hz")
         require(rate_hz > 0, "sample_rate_hz", rate_hz, "a number above 0")
         band(self.band_hz, most_hz=rate_hz / 2)
