@@ -12,9 +12,9 @@ import os
 import signal
 import tempfile
 import zipfile
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from functools import lru_cache
@@ -47,6 +47,8 @@ from tactile_resonance.scan.run_content import SCENE, read_index, read_plan
 from tactile_resonance.scan.scene import SensorUse
 
 STATUS = "poles_status"
+# What one process is given beforehand, so that none waits for work.
+_AHEAD = 2
 # A fit of these found nothing that another one could explain.
 _SURE = (PolesStatus.OK, PolesStatus.NO_COVARIANCE)
 _MODE = (*MODE, "pole_real_rad_s", "pole_imag_rad_s")
@@ -270,8 +272,9 @@ class _Processes:
     """One a core, which end with the context; after an error all children born meanwhile do."""
 
     def __init__(self) -> None:
+        self._count = len(os.sched_getaffinity(0))
         self._before = set(active_children())
-        self._pool = ProcessPoolExecutor(len(os.sched_getaffinity(0)), initializer=_begin_process)
+        self._pool = ProcessPoolExecutor(self._count, initializer=_begin_process)
 
     def __enter__(self) -> _Processes:
         return self
@@ -286,9 +289,15 @@ class _Processes:
             process.join()
 
     def in_order(self, function: Callable[[Task], Found], jobs: Iterable[Task]) -> Iterator[Found]:
-        """What a function gives for each of some jobs."""
+        """What a function gives for each of some jobs, few of which are under way at a time."""
+        waiting: deque[Future[Found]] = deque()
         try:
-            yield from self._pool.map(function, jobs)
+            for job in jobs:
+                waiting.append(self._pool.submit(function, job))
+                if len(waiting) > _AHEAD * self._count:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
         except BrokenProcessPool as error:
             raise OSError(
                 "a process of the fit was ended from outside, as for want of memory"
