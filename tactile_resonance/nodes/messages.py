@@ -314,8 +314,8 @@ def wrench_message(
 ) -> WrenchStamped:
     """Mean of these at the middle of their times; of the force, not of the torque, the tare is taken off."""
     wrench = WrenchStamped()
-    wrench.header.stamp = time_message(ros_ns((wrenches[0].time_ns + wrenches[-1].time_ns) // 2))
-    wrench.header.frame_id = frame_id
+    middle_ns = (wrenches[0].time_ns + wrenches[-1].time_ns) // 2
+    write_header(wrench.header, ros_ns(middle_ns), frame_id)
     count, parts = len(wrenches), wrench.wrench
     x, y, z = (sum(values) / count for values in zip(*(w.force_n for w in wrenches), strict=True))
     bias_x, bias_y, bias_z = cycle.bias_n
@@ -343,8 +343,7 @@ def contact_state(
 ) -> msg.ContactState:
     """What the controller does and knows, without the loop's counts."""
     state = msg.ContactState(state=controller.value, tissue_moves_m=math.nan)
-    state.header.stamp = time_message(time_ns)
-    state.header.frame_id = frame_id
+    write_header(state.header, time_ns, frame_id)
     state.force_n, state.depth_m, state.stiffness_n_per_m = _known(estimate)
     if result is not None:
         state.cause, state.message = result.cause.value, result.message

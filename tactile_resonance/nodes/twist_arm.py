@@ -46,10 +46,9 @@ from tactile_resonance.drivers.twist import (
     velocity_of,
 )
 from tactile_resonance.nodes.managed_node import ManagedNode
-from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.running import COMMANDS, PLACES, SERIES, STEADY, RCLError
 from tactile_resonance.nodes.topic_wrench import EARLIEST_S, Arrivals, TopicWrench
-from tactile_resonance.recording.messages import time_from_message
+from tactile_resonance.recording.messages import time_from_message, write_header
 
 CLOSE_WITHIN_S = 2.0
 COMMANDS_END_NS = 200_000_000
@@ -381,8 +380,7 @@ class TwistArm:
             # of the tool's origin
             a, b, c = cross(vector(turn), lever_m)
             message = TwistStamped()
-            message.header.stamp = time_message(self.clock.ros_ns(time_ns))
-            message.header.frame_id = self._base_frame
+            write_header(message.header, self.clock.ros_ns(time_ns), self._base_frame)
             linear, angular = message.twist.linear, message.twist.angular
             linear.x, linear.y, linear.z = x + a, y + b, z + c
             angular.x, angular.y, angular.z = turn
