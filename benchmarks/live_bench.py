@@ -25,7 +25,7 @@ from tactile_resonance.nodes.goals import Goals
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.processes import NodeProcesses
 from tactile_resonance.report.run_tables import repeats_sentence
-from tactile_resonance.scan.hands import NodeAway
+from tactile_resonance.scan.failures import NodeAway
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.simulation.plant.defaults import TABLE_IN_BASE
 

@@ -19,7 +19,8 @@ from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.poles.estimator import poles_of_bands
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.clearance import Standoffs
-from tactile_resonance.scan.hands import Check, Controls, Measured, PointFailed, Touch
+from tactile_resonance.scan.failures import PointFailed
+from tactile_resonance.scan.hands import Check, Controls, Measured, Touch
 from tactile_resonance.scan.measurement import MeasurementDesign, excitation_of
 from tactile_resonance.scan.messages import make_message, to_cdr
 from tactile_resonance.scan.plan import TRAVEL_M_S, make_plan

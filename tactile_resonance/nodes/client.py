@@ -23,7 +23,7 @@ from tactile_resonance.client import CalibrationOutcome, ScanOutcome, TactileCli
 from tactile_resonance.nodes.goals import Goals, answer_of, wait_for
 from tactile_resonance.nodes.running import NEWEST, POINT_RESULTS, RESULTS, SERIES
 from tactile_resonance.recording.messages import poles_from_message, time_from_message
-from tactile_resonance.scan.hands import NodeAway, ScanEnded
+from tactile_resonance.scan.failures import NodeAway, ScanEnded
 from tactile_resonance.scan.point_result import from_message
 
 if TYPE_CHECKING:

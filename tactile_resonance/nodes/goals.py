@@ -27,14 +27,14 @@ from rclpy.client import Client
 from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 
-from tactile_resonance.scan.hands import (
-    Check,
+from tactile_resonance.scan.failures import (
     Interrupted,
     NodeAway,
     PointDisturbed,
     PointFailed,
     ScanEnded,
 )
+from tactile_resonance.scan.hands import Check
 
 
 def _locked(name: str) -> Callable:

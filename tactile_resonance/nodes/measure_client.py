@@ -25,7 +25,8 @@ from tactile_resonance.nodes.messages import NO_RECORDS, each_to_message
 from tactile_resonance.nodes.node_watch import ScanTime
 from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, SERIES, TRUTHS
 from tactile_resonance.recording.messages import GRIDS, each_from_message, time_from_message
-from tactile_resonance.scan.hands import Check, NodeAway, PointDisturbed, ScanEnded
+from tactile_resonance.scan.failures import NodeAway, PointDisturbed, ScanEnded
+from tactile_resonance.scan.hands import Check
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.point_file import offered_qos
 from tactile_resonance.scan.run_directory import PointRecording

@@ -16,16 +16,9 @@ from std_srvs.srv import Trigger
 from tactile_resonance.action import CalibrateTable, Scan
 from tactile_resonance.nodes.managed_node import ManagedNode, end_goal, in_thread
 from tactile_resonance.poles.result import Poles
+from tactile_resonance.scan.failures import Interrupted, PointFailed, ScanEnded
 from tactile_resonance.scan.goal import ScanGoal
-from tactile_resonance.scan.hands import (
-    Controls,
-    Interrupted,
-    PointFailed,
-    Progress,
-    Request,
-    ScanEnded,
-    Summary,
-)
+from tactile_resonance.scan.hands import Controls, Progress, Request, Summary
 from tactile_resonance.scan.table_calibration import (
     NOT_ESTIMATED,
     CalibrationRequest,

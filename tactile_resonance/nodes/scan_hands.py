@@ -31,18 +31,16 @@ from tactile_resonance.nodes.tip_contact import STATE_TOPIC, TipContact
 from tactile_resonance.record import Contact
 from tactile_resonance.recording.messages import poles_from_message
 from tactile_resonance.scan.clearance import STILL_M, Standoffs, TipUse
-from tactile_resonance.scan.hands import (
-    Check,
+from tactile_resonance.scan.failures import (
     Disturbances,
-    Measured,
     NodeAway,
     PointDisturbed,
     PointFailed,
     ScanEnded,
     Stopped,
     SurfaceEarly,
-    Touch,
 )
+from tactile_resonance.scan.hands import Check, Measured, Touch
 from tactile_resonance.scan.measurement import MeasurementDesign
 from tactile_resonance.scan.points import ScanPoint
 from tactile_resonance.scan.run_directory import PointRecording

@@ -20,9 +20,8 @@ from tactile_resonance.nodes.messages import HOLDS
 from tactile_resonance.nodes.node_watch import ScanTime
 from tactile_resonance.nodes.running import NEWEST
 from tactile_resonance.recording.messages import PROTOCOLS, time_from_message
-from tactile_resonance.scan.hands import (
+from tactile_resonance.scan.failures import (
     NODE_BACK_WITHIN_S,
-    Check,
     PointDisturbed,
     PointFailed,
     ScanEnded,
@@ -30,6 +29,7 @@ from tactile_resonance.scan.hands import (
     SurfaceEarly,
     SurfaceMissing,
 )
+from tactile_resonance.scan.hands import Check
 from tactile_resonance.scan.point_outcome import StateTimes
 from tactile_resonance.scan.tissue_tests import ProtocolRequest
 

@@ -13,7 +13,8 @@ import numpy as np
 from tactile_resonance._typing import FloatArray
 from tactile_resonance.fields import AboveZero, Checked, Range, require
 from tactile_resonance.poles.result import Poles
-from tactile_resonance.scan.hands import Measured, PointFailed
+from tactile_resonance.record import Contact
+from tactile_resonance.scan.failures import PointFailed
 from tactile_resonance.tissue.classify import UNKNOWN, TissueClass, classify, log_density
 from tactile_resonance.tissue.nominal_contact import ContactLoad, NominalContact, refer_to_nominal
 
@@ -268,7 +269,7 @@ class GateKeeper:
         self.left_out: list[tuple[float, float]] = []
         self._shut = False
 
-    def shuts(self, measured: Measured) -> bool:
+    def shuts(self, contact: Contact) -> bool:
         """Whether the measurement under way is to be ended: the force has moved too much, or is another.
 
         Raises
@@ -278,7 +279,6 @@ class GateKeeper:
         """
         if self._gate is None:
             return False
-        contact = measured.origin.contact
         if math.isnan(contact.spread.rms_n):
             reason = contact.reason or "too few forces were measured"
             raise PointFailed(f"gate: how the force moved is unknown: {reason}")
@@ -287,7 +287,7 @@ class GateKeeper:
         self._shut = self._shut or loud
         return self._shut
 
-    def counts(self, measured: Measured) -> bool:
+    def counts(self, contact: Contact) -> bool:
         """Whether a measurement that has ended counts.
 
         Raises
@@ -295,10 +295,9 @@ class GateKeeper:
         PointFailed
             If it does not, and no other may be begun.
         """
-        if not self.shuts(measured):
+        if not self.shuts(contact):
             return True
         assert self._gate is not None
-        contact = measured.origin.contact
         self.left_out.append((contact.force_n, contact.spread.rms_n))
         self._shut = False
         if len(self.left_out) < self._gate.measurements:

@@ -15,16 +15,9 @@ from tactile_resonance.configuration import PACKAGE_NAME, package_version
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.fields import require
 from tactile_resonance.scan.clearance import Standoffs, TipUse, clear_points
+from tactile_resonance.scan.failures import PointFailed, ScanEnded
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal, read_goal, resumed_run
-from tactile_resonance.scan.hands import (
-    Check,
-    Hands,
-    Phase,
-    PointFailed,
-    Progress,
-    ScanEnded,
-    Touch,
-)
+from tactile_resonance.scan.hands import Check, Hands, Phase, Progress, Touch
 from tactile_resonance.scan.measurement import Skipped
 from tactile_resonance.scan.plan import Plan, make_plan, plan_points
 from tactile_resonance.scan.points import ScanPoint

@@ -15,20 +15,22 @@ import numpy as np
 
 from tactile_resonance.poles.result import MainMode, Poles
 from tactile_resonance.scan.decision import Decision, GateKeeper, Verdict, decide
-from tactile_resonance.scan.hands import (
+from tactile_resonance.scan.failures import (
     NODE_BACK_WITHIN_S,
-    Check,
-    Controls,
     Disturbances,
-    Hands,
     Interrupted,
-    Measured,
-    Phase,
     PointDisturbed,
     PointFailed,
+    ScanEnded,
+)
+from tactile_resonance.scan.hands import (
+    Check,
+    Controls,
+    Hands,
+    Measured,
+    Phase,
     Progress,
     Request,
-    ScanEnded,
     Summary,
 )
 from tactile_resonance.scan.plan import Plan
@@ -201,7 +203,7 @@ class ScanRunner:
             wanted = scene.nominal_contact, blocks, scene.precision, design.blocks, design.block_s
             decisions.append(decide(measured.poles, pressed, *wanted))
             self._say(point, Phase.MEASURE, blocks, measured.poles)
-            return keeper.shuts(measured) or decisions[-1].stop
+            return keeper.shuts(force) or decisions[-1].stop
 
         def check() -> None:
             self._controls.check()
@@ -228,7 +230,7 @@ class ScanRunner:
                         recording,
                         check,
                     )
-                    if keeper.counts(made):
+                    if keeper.counts(made.origin.contact):
                         measured = made
                 if tests:
                     self._say(point, Phase.RETRACT)

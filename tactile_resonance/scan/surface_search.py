@@ -27,7 +27,8 @@ from scipy.spatial.transform import Rotation
 
 from tactile_resonance._typing import BoolArray, FloatArray
 from tactile_resonance.fields import require
-from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceMissing, Touch
+from tactile_resonance.scan.failures import PointDisturbed, PointFailed, SurfaceMissing
+from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.points import LeftOut, ScanPoint, tip_orientation
 from tactile_resonance.scan.surface import NormalRequest, Surface, TouchRequest, unit_normal
 

@@ -21,7 +21,7 @@ from unique_identifier_msgs.msg import UUID
 from tactile_resonance.nodes.goals import GoalClient, Goals
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
-from tactile_resonance.scan.hands import Interrupted
+from tactile_resonance.scan.failures import Interrupted
 
 PREEMPTED_S = 0.2
 WITHIN_S = 60.0

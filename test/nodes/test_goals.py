@@ -19,7 +19,7 @@ from tactile_resonance import client as client_module
 from tactile_resonance.client import Ending, TactileClient
 from tactile_resonance.nodes import goals as goals_module
 from tactile_resonance.nodes.goals import ASK_AGAIN_S, GOAL_ENDS_WITHIN_S, TAKEN_WITHIN_S, Goals
-from tactile_resonance.scan.hands import (
+from tactile_resonance.scan.failures import (
     Interrupted,
     NodeAway,
     PointDisturbed,

@@ -25,7 +25,7 @@ from tactile_resonance.nodes.running import EXCITATIONS, POLES, RESULTS, initial
 from tactile_resonance.nodes.simulated_tip import truth_message
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.recording.messages import poles_from_message
-from tactile_resonance.scan.hands import PointDisturbed, PointFailed
+from tactile_resonance.scan.failures import PointDisturbed, PointFailed
 from tactile_resonance.scan.point_file import read_messages
 from tactile_resonance.scan.point_result import POLES_TYPE, PointResult
 from tactile_resonance.scan.points import ScanPoint

@@ -20,7 +20,7 @@ from tactile_resonance.nodes.managed_node import BEAT_S, ManagedNode
 from tactile_resonance.nodes.node_watch import SAID_AFTER_S, SILENT_S, NodeWatch
 from tactile_resonance.nodes.running import initialised
 from tactile_resonance.processes import free_domain_id
-from tactile_resonance.scan.hands import NodeAway
+from tactile_resonance.scan.failures import NodeAway
 
 SOURCE = "/poles_node"
 

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("tactile_resonance.msg", reason="the messages are not built")
 
 from tactile_resonance.nodes import scan_actions
-from tactile_resonance.scan.hands import Interrupted, ScanEnded
+from tactile_resonance.scan.failures import Interrupted, ScanEnded
 
 
 class Node:

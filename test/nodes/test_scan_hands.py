@@ -36,7 +36,7 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.processes import free_domain_id
 from tactile_resonance.record import Contact, Origin
 from tactile_resonance.scan.clearance import Standoffs
-from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceEarly
+from tactile_resonance.scan.failures import PointDisturbed, PointFailed, SurfaceEarly
 from tactile_resonance.scan.measurement import design_measurement
 from tactile_resonance.scan.point_outcome import StateTimes
 from tactile_resonance.scan.points import ScanPoint

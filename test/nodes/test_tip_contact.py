@@ -15,7 +15,7 @@ from tactile_resonance import msg
 from tactile_resonance.contact.goal import Cause, HoldMode
 from tactile_resonance.nodes.messages import time_message
 from tactile_resonance.nodes.tip_contact import UNKNOWN, TipContact
-from tactile_resonance.scan.hands import PointDisturbed, ScanEnded
+from tactile_resonance.scan.failures import PointDisturbed, ScanEnded
 from tactile_resonance.scan.point_outcome import StateTimes
 
 NOT_OF_THE_POINT = (

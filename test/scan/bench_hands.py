@@ -10,7 +10,8 @@ from tactile_resonance.poles.result import Poles
 from tactile_resonance.record import Contact, ForceSpread, Origin
 from tactile_resonance.recording.messages import write_indentation
 from tactile_resonance.scan.decision import BlockLimits, Precise
-from tactile_resonance.scan.hands import Controls, Measured, PointFailed
+from tactile_resonance.scan.failures import PointFailed
+from tactile_resonance.scan.hands import Controls, Measured
 from tactile_resonance.scan.messages import make_message, message_types, to_cdr
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.run_content import read_run

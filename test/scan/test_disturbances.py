@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How often an attempt that was disturbed is repeated."""
 
-from tactile_resonance.scan.hands import (
+from tactile_resonance.scan.failures import (
     ATTEMPTS,
     ATTEMPTS_WITHOUT_NODE,
     Disturbances,

@@ -15,7 +15,8 @@ from tactile_resonance.contact.loop import ContactLoop
 from tactile_resonance.contact.machine import ContactController
 from tactile_resonance.contact.parameters import Limits
 from tactile_resonance.contact.samples import Pose
-from tactile_resonance.scan.hands import PointDisturbed, PointFailed, SurfaceMissing, Touch
+from tactile_resonance.scan.failures import PointDisturbed, PointFailed, SurfaceMissing
+from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.points import ScanPoint, tip_orientation
 from tactile_resonance.scan.scene import ScanScene, parse_scan_scene

@@ -12,8 +12,9 @@ from tactile_resonance.contact.geometry import TipGeometry
 from tactile_resonance.contact.parameters import ContactParameters, Limits
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.scan.clearance import TipUse
+from tactile_resonance.scan.failures import PointFailed, ScanEnded
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal
-from tactile_resonance.scan.hands import PointFailed, ScanEnded, Touch
+from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.run_content import read_run
 from tactile_resonance.scan.run_start import UNCHECKED, prepare, start_run

@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 
 from tactile_resonance.scan import runner
-from tactile_resonance.scan.hands import (
+from tactile_resonance.scan.failures import (
     ATTEMPTS,
     ATTEMPTS_WITHOUT_NODE,
-    Controls,
     NodeAway,
     PointDisturbed,
     PointFailed,
-    Request,
     ScanEnded,
 )
+from tactile_resonance.scan.hands import Controls, Request
 from tactile_resonance.scan.messages import message_types
 from tactile_resonance.scan.point_result import TYPE, PointKind, PointOutcome, from_message
 from tactile_resonance.scan.recorded import recorded_results

@@ -10,7 +10,8 @@ import yaml
 
 from tactile_resonance.contact.geometry import touch_pose
 from tactile_resonance.contact.goal import ContactGoal
-from tactile_resonance.scan.hands import PointFailed, SurfaceMissing, Touch
+from tactile_resonance.scan.failures import PointFailed, SurfaceMissing
+from tactile_resonance.scan.hands import Touch
 from tactile_resonance.scan.plan import make_plan
 from tactile_resonance.scan.scene import read_scan_scene
 from tactile_resonance.scan.surface import TouchRequest

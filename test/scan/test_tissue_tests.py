@@ -15,8 +15,8 @@ from benchmarks.mechanics import relaxation
 from tactile_resonance.cli import main
 from tactile_resonance.contact.samples import Pose
 from tactile_resonance.mechanics.indentation import Prony, Protocol
+from tactile_resonance.scan.failures import ATTEMPTS, PointDisturbed, PointFailed
 from tactile_resonance.scan.goal import Frames, GoalFiles, ScanGoal
-from tactile_resonance.scan.hands import ATTEMPTS, PointDisturbed, PointFailed
 from tactile_resonance.scan.plan import make_plan, plan_rows
 from tactile_resonance.scan.point_result import PointOutcome
 from tactile_resonance.scan.run_content import read_run
