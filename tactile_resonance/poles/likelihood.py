@@ -682,15 +682,11 @@ def _are_flat(power, whole, bins, rules, sums):
     for k in range(rules.pieces * size, bins):
         sums[last] += power[k]
     sums[last] *= size / (bins - last * size)
-    total, logarithm, product = 0.0, 0.0, 1.0
+    total = logarithm = 0.0
     for piece in range(rules.pieces):
         value = sums[piece] * (bins / (whole * size))
         total += value
-        product *= value
-        if not 1e-100 < product < 1e100:  # a logarithm costs as much as all else
-            logarithm += np.log(product)
-            product = 1.0
-    logarithm += np.log(product)
+        logarithm += np.log(value)
     return np.log(total / rules.pieces) - logarithm / rules.pieces <= rules.flat
 
 
