@@ -7,6 +7,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,6 @@ class ReplayDevice:
         self._speed = speed
         self._next = 0
         self._next_after = 0
-        self._file: StoredMeasurement | None = None
         self._measurement: StoredMeasurement | None = None
         self._blocks: dict[int, Record] = {}
         self._playing: Excitation | None = None
@@ -60,10 +60,9 @@ class ReplayDevice:
         self._index = 0
         self._stopped = threading.Event()
         self._closed = False
-        self._entries: Sequence[StoredEntry] = ()
         if entries is None and not path.is_dir():
-            self._file = _measurement_of_file(read_recording(path), path.name)
-            return
+            file = _measurement_of_file(read_recording(path), path.name)
+            entries = [StoredEntry(0, path, lambda: file)]
         problems: list[str] = []
         if entries is None:
             entries, problems = list_measurements(path)
@@ -79,18 +78,6 @@ class ReplayDevice:
         measurement that was cut off ends where it was. What was begun without a single record is passed over.
         """
         asked = excitations[0]
-        if self._file is not None:
-            if asked.level_v == 0:
-                raise DeviceError(f"replay: {self._path} holds no silent record")
-            if self._next > 0:
-                raise DeviceError(f"replay: the recording is over: {self._path} was played")
-            self._next_after = 1
-            self._measurement = self._file
-            label = asked.label or self._path.name
-            return [
-                replace(e, measurement_id=asked.measurement_id, label=label, bands=asked.bands)
-                for e in self._file.excitations
-            ]
         self._measurement = self._find(asked)
         last = self._measurement.records[-1]
         recorded = {e.realisation: e for e in self._measurement.excitations}
@@ -104,8 +91,11 @@ class ReplayDevice:
         recorded[last.realisation] = replace(
             recorded[last.realisation], periods=last.block_index + 1
         )
+        told: dict[str, Any] = {"realisations": len(realisations)}
+        if not self._measurement.measurement_id:  # a file says neither
+            told |= {"measurement_id": asked.measurement_id, "label": asked.label or self._path.name}
         return [
-            replace(e, realisations=len(realisations), bands=e.bands or asked.bands)
+            replace(e, bands=e.bands or asked.bands, **told)
             for e in (recorded[realisation] for realisation in realisations)
         ]
 
@@ -182,7 +172,7 @@ class ReplayDevice:
     def _find(self, asked: Excitation) -> StoredMeasurement:
         """The one named, or the next that holds a record and was driven, or silent, as is asked for."""
         measurement_id, silent = asked.measurement_id, asked.level_v == 0
-        if measurement_id:
+        if measurement_id and self._entries[0].measurement_id:  # a file has none, and is all there is
             named = [entry for entry in self._entries if entry.measurement_id == measurement_id]
             if not named:
                 raise DeviceError(f"replay: no measurement {measurement_id} in {self._path}")
@@ -206,7 +196,7 @@ class ReplayDevice:
                 return measurement
         raise DeviceError(
             f"replay: the recording is over: all {len(self._entries)} measurements of {self._path} "
-            "were played"
+            f"were played, or are {'driven' if silent else 'silent'}"
         )
 
 

@@ -184,6 +184,9 @@ def test_a_plain_file_is_one_measurement(tmp_path, lines):
     np.savez(tmp_path / "m.npz", u=u, y=y, sample_rate_hz=1000.0, samples_per_period=100, **fields)
     before_ns = time.time_ns()
     device = ReplayDevice(tmp_path / "m.npz", speed=0)
+    assert device.plan(asked(5))[0].measurement_id == 5
+    with pytest.raises(DeviceError, match="or are driven"):
+        device.plan([replace(ASKED[0], amplitude_v=0 * ASKED[0].amplitude_v)])
     planned, info, blocks = play(device)
     for found, expected in zip(planned, wanted, strict=True):
         np.testing.assert_array_equal(found.harmonics, expected.harmonics)
