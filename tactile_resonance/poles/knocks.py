@@ -48,15 +48,12 @@ def instant_of_knock(
     few = plan.others_at.size < 2 * plan.problem.sizes[2]
     if exact or few or fit.status() not in FOUND or len(plan.knocks_s) == MOST_KNOCKS:
         return None
-    model = fit.fit
-    theta = np.concatenate([model.denominator[:-1], model.numerator, model.transient])
-    data = BinData.of(y[None, None], u[None, None], plan.order, plan.others_at.size)
-    at = Linearised.of(plan.problem, with_noise(plan, data, theta[None, None])[0], theta)
+    at = linearised_at(plan, u, y, fit)
     root, s = 1 / np.sqrt(at.variance), plan.x[plan.order]
-    weight = root / (plan.problem.denominator @ model.denominator)
+    weight = root / (plan.problem.denominator @ fit.fit.denominator)
     terms = (plan.problem.transient * weight[:, None]).T  # (c, K)
     poles = plan.structure.order
-    own, rings = _orthonormal(terms), _orthonormal(weight * s ** np.arange(poles)[:, None])
+    own, rings = orthonormal(terms), orthonormal(weight * s ** np.arange(poles)[:, None])
     residual = at.error[0] * root
     residual = residual - (own.conj() @ residual).real @ own
     size = scipy.fft.next_fast_len(FINER * plan.bins.size)
@@ -73,14 +70,22 @@ def instant_of_knock(
         score[k + 1 :] -= factor * score[k]
         left[k + 1 :, k + 1 :] -= factor[:, None] * left[k, k + 1 :]
     fall[~(determinant > LEAST_LEFT ** (poles / 2))] = 0.0
-    best, dof = int(np.argmax(fall)), plan.bins.size - theta.size / 2
+    best, dof = int(np.argmax(fall)), plan.bins.size - at.variance_slope.shape[1] / 2
     share = min(fall[best] / np.sum(np.abs(residual) ** 2), 1.0)
     if not size * special.betainc(dof - poles / 2, poles / 2, 1 - share) <= FALSE_ALARM:
         return None
     return float(best / (size * plan.resolution_hz))
 
 
-def _orthonormal(rows: ComplexArray) -> ComplexArray:
+def linearised_at(plan: JointPlan, u: ComplexArray, y: ComplexArray, fit: PolesBatch) -> Linearised:
+    """Errors of bins (K,) at a fit to them of shape (), with the variances of the noise that they show."""
+    model = fit.fit
+    theta = np.concatenate([model.denominator[:-1], model.numerator, model.transient])
+    data = BinData.of(y[None, None], u[None, None], plan.order, plan.others_at.size)
+    return Linearised.of(plan.problem, with_noise(plan, data, theta[None, None])[0], theta)
+
+
+def orthonormal(rows: ComplexArray) -> ComplexArray:
     """Rows (c, K) that span the same with real factors, the real part of each product 0, of each square 1."""
     parts = np.ascontiguousarray(rows).view(float)
     return np.ascontiguousarray(np.linalg.qr(parts.T)[0].T).view(complex)
