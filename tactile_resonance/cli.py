@@ -16,11 +16,21 @@ from typing import NoReturn
 from tactile_resonance.configuration import package_version
 from tactile_resonance.processes import ENDING, keep_memory
 
-COMMANDS = (
-    *("plan", "bench_scan", "report", "analyze", "reidentify", "calibrate", "references"),
-    *("mechanics", "benchmark", "calibrate_table", "simulate", "first_use"),
-)
-"""Modules of `commands`, in the order in which help lists them."""
+COMMANDS = {
+    "plan": ("plan",),
+    "bench_scan": ("demo", "scan", "resume"),
+    "report": ("report", "live"),
+    "analyze": ("analyze",),
+    "reidentify": ("reidentify",),
+    "calibrate": ("calibrate",),
+    "references": ("references", "compare"),
+    "mechanics": ("mechanics",),
+    "benchmark": ("figures", "benchmark"),
+    "calibrate_table": ("calibrate-table",),
+    "simulate": ("simulate-ur", "simulate-cell"),
+    "first_use": ("check-robot", "compile"),
+}
+"""Modules of `commands`, in the order in which help lists them, and the commands of each."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -33,8 +43,9 @@ class OneLineParser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit status, 0 or 1 with one line on stderr, 130 when interrupted."""
+    given = sys.argv[1:] if arguments is None else arguments
     try:
-        parsed = _parser().parse_args(arguments)
+        parsed = _parser(given[:1]).parse_args(given)
         return parsed.run(parsed)
     except (ValueError, OSError) as error:
         print(f"tactile_resonance: {_one_line(error)}", file=sys.stderr)
@@ -73,8 +84,11 @@ def command() -> NoReturn:
     os._exit(status)
 
 
-def _parser() -> OneLineParser:
-    """Parser of all commands; loads them here, so that an interrupt meanwhile ends in order."""
+def _parser(asked: Sequence[str]) -> OneLineParser:
+    """Parser of the command asked for, of all where it is none; loads them here: an interrupt ends in order.
+
+    To load all of them takes longer than most commands do.
+    """
     # One thread: the arrays are small, and BLAS threads that wait for a second core cost more than they
     # give. Before numpy is imported, which reads it once.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -88,7 +102,7 @@ def _parser() -> OneLineParser:
         "--version", action="version", version=version, help="print the version and end"
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for name in COMMANDS:
+    for name in [name for name, own in COMMANDS.items() if {*own}.intersection(asked)] or COMMANDS:
         import_module(f"tactile_resonance.commands.{name}").add_parser(commands)
     return parser
 

@@ -43,12 +43,30 @@ from types import SimpleNamespace
 from tactile_resonance import cli
 
 parsed = SimpleNamespace(run=lambda _: os.kill(os.getpid(), signal.{name}))
-cli._parser = lambda: SimpleNamespace(parse_args=lambda _: parsed)
+cli._parser = lambda _: SimpleNamespace(parse_args=lambda _: parsed)
 cli.command()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 130
     assert done.stderr == "tactile_resonance: interrupted\n"
+
+
+def test_the_commands_of_each_module_are_known_before_it_is_loaded():
+    for module, own in cli.COMMANDS.items():
+        for name in own:
+            made = cli._parser([name])._actions[-1].choices
+            assert tuple(made) == own, module
+    every = tuple(name for own in cli.COMMANDS.values() for name in own)
+    for asked in ([], ["nothing"], ["--help"]):
+        assert tuple(cli._parser(asked)._actions[-1].choices) == every
+
+
+def test_a_command_loads_nothing_of_the_others():
+    program = "import sys; from tactile_resonance import cli; cli._parser(['demo']); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    found = set(done.stdout.split())
+    assert "tactile_resonance.commands.bench_scan" in found
+    assert found.isdisjoint({"scipy", "numba", "matplotlib", "tactile_resonance.commands.simulate"})
 
 
 def test_an_option_has_the_kind_of_its_default_which_help_tells():
