@@ -18,6 +18,7 @@ place of the one that is missed least, and so on while the cost falls.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -170,14 +171,13 @@ def least_squares(
     first_size : (K,) float, optional
         ``|A|`` that start values begin from; 1 when absent.
     """
-    newest: list[tuple[bytes, Linearised]] = []
+
+    @lru_cache(maxsize=1)  # a Jacobian is asked for where the residuals were asked for last
+    def kept(theta: bytes) -> Linearised:
+        return Linearised.of(problem, data, np.frombuffer(theta), delay_phase)
 
     def at(theta: FloatArray) -> Linearised:
-        """Kept: a Jacobian is asked for where the residuals were asked for last."""
-        key = theta.tobytes()
-        if not newest or newest[0][0] != key:
-            newest[:] = [(key, Linearised.of(problem, data, theta, delay_phase))]
-        return newest[0][1]
+        return kept(theta.tobytes())
 
     with np.errstate(all="ignore"):
         if start is None:
@@ -189,9 +189,9 @@ def least_squares(
         if np.isfinite(begin).all() and begin.size >= start.size:
             try:
                 found = scipy.optimize.least_squares(
-                    lambda theta: _finite(at(theta).residual.view(float).ravel(), 1e150),
+                    lambda theta: np.nan_to_num(at(theta).residual.view(float).ravel(), nan=1e150),
                     start,
-                    lambda theta: _finite(at(theta).jacobian.reshape(-1, theta.size), 0.0),
+                    lambda theta: np.nan_to_num(at(theta).jacobian.reshape(-1, theta.size)),
                     method="lm",
                     x_scale="jac",
                     ftol=LEAST_SQUARES_TOLERANCE,
@@ -259,11 +259,6 @@ def _solution(
         np.full((1, 2), np.nan),
         np.ones(1, bool),
     )
-
-
-def _finite(values: FloatArray, otherwise: float) -> FloatArray:
-    """Values with others in place of those that are not finite; themselves where all are."""
-    return values if np.isfinite(values).all() else np.nan_to_num(values, nan=otherwise)
 
 
 def linear_step(problem: Problem, data: BinData, size: FloatArray) -> FloatArray:
