@@ -250,8 +250,8 @@ def transient_free_spectra(
         projected = np.matmul(group.projector, columns).view(complex)  # (..., 2, 1 + dof, L)
         spectra[..., lines] = projected[..., 0, :]
         y, u = projected[..., 0, 1:, :], projected[..., 1, 1:, :]  # residuals
-        covariance[..., 0, 0, lines] = _sum_of_squares(y)
-        covariance[..., 1, 1, lines] = _sum_of_squares(u)
+        covariance[..., 0, 0, lines] = power(y).sum(axis=-2)
+        covariance[..., 1, 1, lines] = power(u).sum(axis=-2)
         cross = np.sum(y * u.conj(), axis=-2)  # (..., L)
         covariance[..., 0, 1, lines] = cross
         covariance[..., 1, 0, lines] = cross.conj()
@@ -266,13 +266,6 @@ def transient_free_spectra(
         noise_dof=groups[0].projector.shape[0] - 1,
         method=f"fast local polynomial method, order {order}",
     )
-
-
-def _sum_of_squares(residual: ComplexArray) -> FloatArray:
-    """(..., L) sum of absolute squares of residuals (..., dof, L)."""
-    parts = residual.view(float)  # (..., dof, 2 L), real and imaginary alternate
-    squares = np.einsum("...ij,...ij->...j", parts, parts)  # no complex product, no root
-    return np.asarray(squares[..., 0::2] + squares[..., 1::2])
 
 
 @dataclass(frozen=True, eq=False)
