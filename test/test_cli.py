@@ -69,6 +69,15 @@ def test_a_command_loads_nothing_of_the_others():
     assert found.isdisjoint({"scipy", "numba", "matplotlib", "tactile_resonance.commands.simulate"})
 
 
+def test_pages_of_a_run_load_no_statistics():
+    """As each demo does at its end: they take longer to load than the pages to be made."""
+    program = "import sys; from tactile_resonance.report import run_map, run_report; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    found = set(done.stdout.split())
+    assert "tactile_resonance.report.drawing" in found
+    assert found.isdisjoint({"scipy.signal", "scipy.stats"})
+
+
 def test_an_option_has_the_kind_of_its_default_which_help_tells():
     parser = argparse.ArgumentParser()
     add_option(parser, "--level P", 0.01, "of a test")

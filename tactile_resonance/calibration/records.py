@@ -9,7 +9,8 @@ from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, signal
+import scipy  # its parts are loaded where they are used first: scipy.signal takes 0.6 s
+from scipy import ndimage
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.calibration.model import SensorModel
@@ -160,7 +161,7 @@ def _peaks(
     """(n,) natural frequencies [rad/s], damping ratios and strengths of resonances in a response."""
     # a peak of chi^2 / (2 zeta w): chi goes as beta, w as beta^2, so that all peaks are about as high
     size = -h.imag * np.abs(s)
-    found, traits = signal.find_peaks(size, prominence=PEAK_HEIGHT * size.max(), width=0)
+    found, traits = scipy.signal.find_peaks(size, prominence=PEAK_HEIGHT * size.max(), width=0)
     ends = np.interp([traits["left_ips"], traits["right_ips"]], np.arange(s.size), np.abs(s))
     if modes is not None:
         kept = np.sort(np.argsort(-traits["prominences"])[:modes])
