@@ -35,7 +35,8 @@ def idle(demonstration):
 
 
 def test_a_load_costs_time_and_nothing_else(idle, demonstration, domain, tmp_path):
-    load = Load("busy, and stopped", busy_loops=2, without_priority=True, stopped=STOPPED)
+    # one core and a loop on it: as scarce as two cores with two, and half of what the loops use up meanwhile
+    load = Load("busy, and stopped", 1, pinned=True, without_priority=True, stopped=STOPPED)
     shown = demonstrate(tmp_path, demonstration.scene, HOST, load)
     assert faults(shown, findings(shown.run_folder), idle) == []
     assert len(shown.stopped) >= 3, "it was over before they were stopped"
