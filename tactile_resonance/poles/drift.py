@@ -22,7 +22,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 import scipy.fft
 from numpy.polynomial import legendre
-from scipy import optimize, special
+from scipy import special
 
 from tactile_resonance._typing import ComplexArray, FloatArray, IntArray
 from tactile_resonance.poles.data import BinData, follows_input, rough_noise, with_noise
@@ -383,7 +383,7 @@ def _jump(modes: DriftingModes, y: ComplexArray, drift: FloatArray) -> tuple[str
     starts = np.ascontiguousarray(np.vstack([SHARES, parts]).T)
     start = min(starts, key=lambda values: float(np.sum(residual(values) ** 2)))
     most = {"xtol": LAST_CHANGE, "ftol": LAST_CHANGE, "max_nfev": MOST_EVALUATIONS}
-    best = optimize.least_squares(residual, start, method="lm", x_scale="jac", **most)
+    best = scipy.optimize.least_squares(residual, start, method="lm", x_scale="jac", **most)
     gain = plan.bins.size * np.log(np.sum(left(polynomials) ** 2) / (2 * best.cost))
     share, parts = best.x[0], mean + best.x[1:].view(complex).reshape(2, -1, 1)
     if not (gain > MORE_LIKELY and 0 < share < 1):
