@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 BLOCK = 48
 """Bins taken together: a multiple of the vectors of all processors, and few enough for the cache."""
+CACHE_LINE = 64  # bytes
 GROUP = 16
 """Records that are fitted side by side."""
 
@@ -270,12 +271,21 @@ class _Work(NamedTuple):
 
 
 @inner
+def _aligned(size):
+    """Zeros from a multiple of a cache line on, so that vectors as long as one are not read in two halves."""
+    memory = np.zeros(size + CACHE_LINE // 8)
+    first = -memory.ctypes.data % CACHE_LINE // 8
+    return memory[first : first + size]
+
+
+@inner
 def _memory(tables, points, records):
     """Memory for so many points."""
     c, n = tables.c, tables.a + tables.b + tables.c
     undriven = tables.undriven.last.shape[0]
     blocks = undriven + tables.driven.last.shape[0]
-    flat, values = np.zeros(ROWS * BLOCK), np.zeros((points, records, blocks, PLANES * BLOCK))
+    flat, size = _aligned(ROWS * BLOCK), points * records * blocks * PLANES * BLOCK
+    values = _aligned(size).reshape(points, records, blocks, PLANES * BLOCK)
     values[..., INVERSE * BLOCK : (INVERSE + 1) * BLOCK] = 1.0  # of what blocks are filled up with
     size = n * (n + 1) + 1
     return _Work(
@@ -290,9 +300,9 @@ def _memory(tables, points, records):
         np.zeros((points, records, 2, size)),
         np.zeros((points, 2)),
         np.zeros((points, 2)),
-        np.zeros((records, n, n + 1, points)),
-        np.zeros((n - c, n - c + 1, points)),
-        np.zeros((records, n, points)),
+        _aligned(records * n * (n + 1) * points).reshape(records, n, n + 1, points),
+        _aligned((n - c) * (n - c + 1) * points).reshape(n - c, n - c + 1, points),
+        _aligned(records * n * points).reshape(records, n, points),
         np.zeros(points),
     )
 

@@ -21,6 +21,7 @@ from tactile_resonance.poles.fit import SEVERAL_MODES, best_of_split, minimise
 from tactile_resonance.poles.lacking import Directions
 from tactile_resonance.poles.likelihood import (
     BLOCK,
+    CACHE_LINE,
     ROW_A,
     ROW_AA,
     ROW_AB,
@@ -152,7 +153,13 @@ def _in_pairs(
 
 def _blocks(rows: list[FloatArray], blocks: int) -> FloatArray:
     """(blocks, rows, BLOCK) of rows (blocks BLOCK,)."""
-    return np.ascontiguousarray(np.array(rows, float).reshape(len(rows), blocks, BLOCK).swapaxes(0, 1))
+    values = np.array(rows, float).reshape(len(rows), blocks, BLOCK)
+    # from a multiple of a cache line on: vectors as long as one would otherwise be read in two halves
+    memory = np.empty(values.nbytes + CACHE_LINE, np.uint8)
+    first = -memory.ctypes.data % CACHE_LINE
+    aligned = memory[first : first + values.nbytes].view(float).reshape(blocks, len(rows), BLOCK)
+    aligned[:] = values.swapaxes(0, 1)
+    return aligned
 
 
 class Tables(NamedTuple):
