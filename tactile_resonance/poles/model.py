@@ -9,6 +9,7 @@ conditioned (Forsythe 1957; Brubeck, Nakatsukasa, Trefethen, *Vandermonde with A
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -244,11 +245,16 @@ class RationalModel:
         derivatives are those of the poles by the free coefficients of A.
         """
         x = self.variable.of_s(poles_rad_s)
-        values, slopes = self.denominator_basis.at(x)
-        # A(x; a) = 0 along the root: dx = - dA / A'
-        factor = self.variable.slope(x) / _dot(slopes, self.denominator)
-        residues = _dot(self.numerator_basis.at(x, 0)[0], self.numerator) * factor
-        return residues * self._turn(poles_rad_s), -factor[..., None] * values[..., :-1]
+        points = math.prod(x.shape[:-1])
+        arrays = (x, self.variable.slope(x), self.denominator, self.numerator)
+        hessenberg = self.denominator_basis.hessenberg, self.numerator_basis.hessenberg
+        k, n = x.shape[-1], hessenberg[0].shape[1]
+        residues, sensitivity = np.empty((points, k), complex), np.empty((points, k, n), complex)
+        _residues_and_sensitivity(
+            *(array.reshape(points, array.shape[-1]) for array in arrays), *hessenberg, residues, sensitivity
+        )
+        turned = residues.reshape(x.shape) * self._turn(poles_rad_s)
+        return turned, sensitivity.reshape(*x.shape, n)
 
     def _turn(self, poles_rad_s: ComplexArray) -> ComplexArray | float:
         """(..., k) what the delay makes of residues at poles (..., k)."""
@@ -297,6 +303,38 @@ class RationalModel:
         """(..., k, 2, 2) of (Re, Im) of simple zeros (..., k); see `residue_covariance`."""
         first = self.denominator.shape[-1] - 1
         return real_covariance(self.zero_sensitivity(zeros_rad_s), coefficients[..., first:, first:])
+
+
+@entry
+def _residues_and_sensitivity(
+    x, ds_dx, denominator, numerator, hessenberg_a, hessenberg_b, residues, sensitivity
+):
+    """Of models (points, terms) at their poles x (points, k), into the last, (points, k) and (points, k, n)."""
+    (points, count), n, terms = x.shape, hessenberg_a.shape[1], hessenberg_b.shape[1] + 1
+    value, slope = np.empty(max(n + 1, terms), np.complex128), np.empty(n + 1, np.complex128)
+    for point in range(points):
+        for k in range(count):
+            at = x[point, k]
+            value[0], slope[0], derivative = 1.0, 0.0, 0j
+            for i in range(n):
+                new, more = at * value[i], at * slope[i] + value[i]
+                for j in range(i + 1):
+                    new -= hessenberg_a[j, i] * value[j]
+                    more -= hessenberg_a[j, i] * slope[j]
+                value[i + 1], slope[i + 1] = new / hessenberg_a[i + 1, i], more / hessenberg_a[i + 1, i]
+                derivative += slope[i + 1] * denominator[point, i + 1]
+            # A(x; a) = 0 along the root: dx = - dA / A'
+            factor = ds_dx[point, k] / derivative
+            for i in range(n):
+                sensitivity[point, k, i] = -factor * value[i]
+            above = complex(numerator[point, 0])
+            for i in range(terms - 1):
+                new = at * value[i]
+                for j in range(i + 1):
+                    new -= hessenberg_b[j, i] * value[j]
+                value[i + 1] = new / hessenberg_b[i + 1, i]
+                above += value[i + 1] * numerator[point, i + 1]
+            residues[point, k] = above * factor
 
 
 def modes_in_band(poles_rad_s: ComplexArray, band_hz: tuple[float, float]) -> ComplexArray:
