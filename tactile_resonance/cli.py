@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import NoReturn
 
-from tactile_resonance.configuration import package_version
 from tactile_resonance.processes import ENDING, keep_memory
 
 COMMANDS = {
@@ -39,6 +38,17 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """End with status 2."""
         self.exit(2, f"tactile_resonance: {message} (see {self.prog} --help)\n")
+
+
+class Version(argparse.Action):
+    """Prints the version, and ends; no other command needs the file in which it stands, package.xml."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        """End with status 0."""
+        from tactile_resonance.configuration import package_version
+
+        print(f"tactile_resonance {package_version()}")
+        parser.exit()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -97,10 +107,7 @@ def _parser(asked: Sequence[str]) -> OneLineParser:
         prog="tactile_resonance",
         description="Tactile resonance sensing: from an excited bimorph to the poles of the tissue it touches.",
     )
-    version = f"tactile_resonance {package_version()}"
-    parser.add_argument(
-        "--version", action="version", version=version, help="print the version and end"
-    )
+    parser.add_argument("--version", action=Version, nargs=0, help="print the version and end")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for name in [name for name, own in COMMANDS.items() if {*own}.intersection(asked)] or COMMANDS:
         import_module(f"tactile_resonance.commands.{name}").add_parser(commands)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tactile_resonance import cli
+from tactile_resonance import cli, configuration
 from tactile_resonance.commands.options import add_option
 from tactile_resonance.mechanics import course
 from tactile_resonance.processes import ENDING
@@ -25,6 +25,19 @@ def test_version_is_that_of_the_package(capsys):
         cli.main(["--version"])
     version = ElementTree.parse(ROOT / "package.xml").findtext("version")
     assert capsys.readouterr().out == f"tactile_resonance {version}\n"
+
+
+def test_no_other_command_needs_the_file_of_the_version(monkeypatch, capsys):
+    # it is not where the package alone was installed, as by pip into a folder or for one user
+    def missing(_):
+        raise FileNotFoundError("shared file 'package.xml' not found")
+
+    monkeypatch.setattr(configuration, "share_path", missing)
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["analyze", "--help"])
+    assert "--band" in capsys.readouterr().out
+    assert cli.main(["--version"]) == 1
+    assert "package.xml" in capsys.readouterr().err
 
 
 def test_a_program_that_calls_a_command_keeps_its_handlers_of_signals(handlers):
