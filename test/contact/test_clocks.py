@@ -37,6 +37,23 @@ def test_the_error_is_within_the_stated_uncertainty(seconds, drift):
     assert np.sqrt(np.mean(np.square(ratios))) < 1.2  # a standard deviation, not a hope
 
 
+def test_the_drift_of_messages_that_come_evenly_is_that_of_the_lower_edge():
+    # one in each block, an odd number of blocks: the middle one lies on their mean
+    wrong = []
+    for seed in range(40):
+        delay = np.random.default_rng(seed).exponential(3e-4, 22)
+        tracker, t = ClockTracker(), np.arange(22) * 0.25
+        for remote_s, late_s in zip(t, delay, strict=True):
+            tracker.add(remote_s, START_NS + round((remote_s + late_s) * 1e9))
+        remote_s = float(t[-1])
+        slope = (tracker.to_local_ns(remote_s + 1.0) - tracker.to_local_ns(remote_s)) * 1e-9 - 1.0
+        # the edge touches complete blocks on both sides of their mean, and none lies below it
+        above = delay[:-1] - slope * t[:-1]
+        touched = np.flatnonzero(above < above.min() + 1e-8)
+        wrong.append(not touched[0] <= 10 <= touched[-1] or touched.size < 2)
+    assert not any(wrong)
+
+
 def test_drift_is_found():
     tracker = ClockTracker(SHORTEST_S)
     remote_s, _ = feed(tracker, 40.0, 8e-5, 1)
