@@ -373,7 +373,7 @@ def whole_harmonics(harmonics: npt.ArrayLike) -> IntArray:
         If they are no whole numbers.
     """
     values = np.asarray(harmonics).ravel()
-    if not (values.dtype.kind in "iuf" and (values % 1 == 0).all()):  # of NaN and infinity there is no rest
+    if not (values.dtype.kind in "iuf" and np.isfinite(values).all() and (values % 1 == 0).all()):
         raise ValueError(
             f"harmonics: {values[:5].tolist()}... of type {values.dtype}, expected whole multiples "
             "of the sample rate over the samples per period"

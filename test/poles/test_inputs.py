@@ -104,6 +104,7 @@ def test_a_bad_structure_is_named(options, field):
     [
         ({"harmonics": HARMONICS + 0.5}, r"harmonics: \[4.5"),
         ({"harmonics": np.where(HARMONICS == 5, np.nan, HARMONICS)}, "harmonics: .*nan"),
+        ({"harmonics": np.where(HARMONICS == 5, np.inf, HARMONICS)}, "harmonics: .*inf"),
         ({"harmonics": HARMONICS > 0}, "harmonics: .*bool"),
         ({"harmonics": ["80", "81"]}, "harmonics: "),
         ({"sample_rate_hz": np.inf}, "sample_rate_hz: got inf"),
@@ -124,6 +125,7 @@ def test_a_bad_structure_is_named(options, field):
         ({"y": record()[1].astype(str)}, "y: values of type"),
     ],
 )
+@pytest.mark.filterwarnings("error")  # one line says what is wrong
 def test_a_bad_record_is_named(changes, said):
     with pytest.raises(ValueError, match=said):
         from_record(**changes)
