@@ -51,10 +51,13 @@ class NodeProcesses(contextlib.AbstractContextManager["NodeProcesses"]):
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def start(self, node: str, parameters: Mapping[str, object] | None = None) -> None:
+    def start(
+        self, node: str, parameters: Mapping[str, object] | None = None, niceness: int = 0
+    ) -> None:
         """Start a node as its console script does, with parameters of its own; see `start_child`."""
         program = f"from tactile_resonance.nodes.{node} import main; main()"
-        command = [*self._prefix, sys.executable, "-c", program, "--ros-args"]
+        nice = ["nice", "-n", str(niceness)] if niceness else []
+        command = [*nice, *self._prefix, sys.executable, "-c", program, "--ros-args"]
         for name, value in (parameters or {}).items():
             command += ["-p", f"{name}:={json.dumps(value, default=str)}"]  # JSON is YAML
         self._log_folder.mkdir(parents=True, exist_ok=True)
@@ -62,13 +65,16 @@ class NodeProcesses(contextlib.AbstractContextManager["NodeProcesses"]):
             self._processes[node] = start_child(command, stdout=log)
 
     def bring_up(
-        self, nodes: Sequence[str], parameters: Mapping[str, Mapping[str, object]] | None = None
+        self,
+        nodes: Sequence[str],
+        parameters: Mapping[str, Mapping[str, object]] | None = None,
+        niceness: Mapping[str, int] | None = None,
     ) -> None:
         """Start nodes and the manager that configures and activates them in this order."""
         given = dict(parameters or {})
         given["manager_node"] = {"nodes": list(nodes)}
         for node in (*nodes, "manager_node"):
-            self.start(node, given.get(node))
+            self.start(node, given.get(node), (niceness or {}).get(node, 0))
 
     @property
     def pids(self) -> dict[str, int]:

@@ -95,6 +95,15 @@ def test_parameters_reach_a_node_as_they_are(tmp_path):
     assert {name: yaml.safe_load(text) for name, text in read.items()} == {**given, "folder": str(tmp_path)}
 
 
+def test_nodes_that_compute_give_way_to_others(tmp_path):
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    with NodeProcesses(tmp_path, ("sh", "-c", "nice")) as nodes:
+        nodes.bring_up(["contact_node", "poles_node"], niceness={"poles_node": 5})
+        told_of_ended(nodes, 3)
+    said = {node: int((tmp_path / f"{node}.log").read_text()) for node in ("contact_node", "poles_node")}
+    assert said == {"contact_node": own, "poles_node": min(19, own + 5)}
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="the slack of timers is known on Linux")
 @pytest.mark.parametrize("priority", [0, 1])
 def test_a_thread_keeps_the_slack_of_timers_with_which_it_was_started(priority):

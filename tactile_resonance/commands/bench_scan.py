@@ -33,6 +33,11 @@ if TYPE_CHECKING:
 
 NODES = bringup.NODES[:-1]
 """All but the manager."""
+# On the wall clock, without real-time priority, what computes gives way to what lives by milliseconds: the
+# simulated robot and the control loop. Each node is a session of its own: where the scheduler groups processes by
+# session (autogroup, not within a cgroup that shares out processors), niceness has no effect between them.
+COMPUTING = ("excitation_node", "frf_node", "poles_node", "pole_map_node", "scan_node")
+NICENESS = 10
 HUNG_AFTER_S = 60.0
 """A scan_node that is silent for so long hangs; it reports each second, and watches the other nodes itself."""
 LOOK_S = 3.0  # where one node of a domain is found, the others are within this
@@ -223,16 +228,18 @@ def run_job(job: Job) -> int:
         f"ROS_AUTOMATIC_DISCOVERY_RANGE={os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']}",
         flush=True,
     )
-    if job.real_time and not may_take_priority(PRIORITY):
+    priority = may_take_priority(PRIORITY)
+    if job.real_time and not priority:
         print("real-time priority is not permitted here (rtprio): contacts may have to be repeated")
     work = job.output.with_name(job.output.name + ".work")
     parameters = node_parameters(job, bool(content.tissue_classes), work, content.frame_id)
     parameters["pole_map_node"]["unknown_level"] = content.unknown_level
     if content.adaptive is not None and isinstance(content.adaptive.wanted, LevelSet):
         parameters["pole_map_node"]["adaptive_scene"] = str(job.scene)
+    computing = () if priority or not job.real_time else COMPUTING
     try:
         with noting_signals() as check_signals, NodeProcesses(work / "log") as nodes:
-            nodes.bring_up(NODES, parameters)
+            nodes.bring_up(NODES, parameters, niceness=dict.fromkeys(computing, NICENESS))
             result = _scan(nodes, job, check_signals)
     # the nodes have ended: whether a run was begun is certain now
     except (RuntimeError, ValueError) as error:
