@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from tactile_resonance import msg
+from tactile_resonance.fields import build
 from tactile_resonance.frf.measurement import MeasurementFrf
 from tactile_resonance.frf.result import FRF, FrfStatus
 from tactile_resonance.multisine import Excitation
@@ -51,7 +52,7 @@ class FrfNode(ManagedNode):
         self.listen(msg.Record, "record", self._on_record, RESULTS)
 
     def _on_excitation(self, message: msg.Excitation) -> None:
-        excitation = excitation_from_message(message)
+        excitation = build(excitation_from_message, f"{message.excitation_id}:", message)
         # records of the measurement before may still be queued: forget the oldest only
         self._excitations.pop(excitation.excitation_id, None)
         self._excitations[excitation.excitation_id] = excitation
@@ -63,7 +64,7 @@ class FrfNode(ManagedNode):
             self._take(record)
 
     def _on_record(self, message: msg.Record) -> None:
-        self._take(record_from_message(message))
+        self._take(build(record_from_message, f"excitation {message.excitation_id}:", message))
 
     def _take(self, record: Record) -> None:
         """Publish an FRF, or why there is none: a reader waits for an answer to every record."""

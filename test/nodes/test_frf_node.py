@@ -120,7 +120,7 @@ def test_what_does_not_fit_is_refused_and_the_next_is_taken(node):
     broken = excitation_to_message(excitation(6), 0, "tip")
     broken.phase_rad.append(1.0)
     hear(node, "excitation", broken)
-    assert node.health._error.startswith("excitation: ")
+    assert node.health._error.startswith("excitation: 106: ")
     assert [m.status for m in node.published] == [1, 3]  # no covariance yet; failed
     assert "200 and 201 samples" in node.published[1].message
     message, records = messages(7)
@@ -137,7 +137,7 @@ def test_a_record_without_a_sample_rate_does_no_harm(node, rate_hz):
     hear(node, "excitation", message)
     hear(node, "record", records[0])
     assert node.published == []
-    assert node.health._error.startswith("record: sample_rate_hz: ")
+    assert node.health._error.startswith("record: excitation 108: sample_rate_hz: ")
     records[0].sample_rate_hz = RATE_HZ
     for record in records:
         hear(node, "record", record)
