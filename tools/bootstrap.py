@@ -32,6 +32,7 @@ THIS_PYTHON = f"{sys.version.split()[0]} {sys.executable}"
 PACKAGES_STAMP = packages.VENV / ".stamp.json"
 BUILD_STAMP = build.INSTALL / ".stamp.json"
 FITS_STAMP = build.INSTALL / ".fits.json"
+COMPILED = re.compile(r"^@(njit|entry|inner)\b", re.MULTILINE)
 
 
 def main() -> int:
@@ -116,8 +117,9 @@ def wanted_build(packages_key: Stamp) -> Stamp:
 
 
 def wanted_fits(packages_key: Stamp) -> Stamp:
-    """What numba's cache of the fits depends on: it looks at the place and date of each source."""
-    sources = [ROOT / name for name in build.FITS]
+    """What numba's cache depends on: it looks at the place and date of each source that it compiles from."""
+    modules = (path for path in files(["tactile_resonance"]) if path.suffix == ".py")
+    sources = [path for path in modules if COMPILED.search(path.read_text(encoding="utf-8"))]
     return {
         "packages": digest([json.dumps(packages_key)]),
         "source": contents(sources),

@@ -19,14 +19,6 @@ COLCON_BUILD = BUILD / NAMED / "tactile_resonance"
 INSTALL = ROOT / f"install{BESIDE}"
 INTERFACES = ("msg", "srv", "action")
 INSTALLED = ("tactile_resonance", "config", "launch")
-FITS = tuple(
-    f"tactile_resonance/{name}.py"
-    for name in (
-        *("poles/likelihood", "mechanics/course", "contact/contact_filter"),
-        *("simulation/cell/transducer", "simulation/noise", "simulation/tissue/indenter"),
-        *(f"simulation/ur5e/{name}" for name in ("forces", "kinematics", "poses")),
-    )
-)
 
 # What cmake looks for, in its order.
 _COMPILERS = {

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 NODES = bringup.NODES[:-1]
 """All but the manager."""
 # On the wall clock, without real-time priority, what computes gives way to what lives by milliseconds: the
-# simulated robot and the control loop. Each node is a session of its own: where the scheduler groups processes by
-# session (autogroup, not within a cgroup that shares out processors), niceness has no effect between them.
+# simulated robot and the control loop. Each node is a session of its own: where the scheduler groups processes
+# by session (autogroup, not within a cgroup that shares out processors), niceness has no effect between them.
 COMPUTING = ("excitation_node", "frf_node", "poles_node", "pole_map_node", "scan_node")
 NICENESS = 10
 HUNG_AFTER_S = 60.0

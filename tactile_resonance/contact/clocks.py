@@ -146,8 +146,9 @@ def _lower_edge(points: list[tuple[float, float]]) -> tuple[float, float]:
     """Offset and slope of the edge of the lower convex hull that spans the mean of x."""
     x, y = np.array(points).T
     left, right = x < x.mean(), x >= x.mean()
-    # Of all lines from a point before the mean to one after it the hull's edge is lowest between the two next to
-    # the mean. At a point that lies on the mean itself, as where blocks come evenly, all lines to it are as low.
+    # Of all lines from a point before the mean to one after it the hull's edge is lowest between the two next
+    # to the mean. At a point that lies on the mean itself, as where blocks come evenly, all lines to it are as
+    # low.
     between = (x[left].max() + x[right].min()) / 2
     slopes = (y[right] - y[left, None]) / (x[right] - x[left, None])
     heights = y[left, None] + slopes * (between - x[left, None])
