@@ -43,18 +43,18 @@ class TwistController:
         self._bench, self._period_ns = bench, round(1e9 / rate_hz)
         self._commanded_ns, self._twist = 0, np.zeros(6)
         self.wrenches: list[CellSample] = []
-        bench.clock.on_step.append(self._record)
+        bench.on_step.append(self._record)
         self.step()
 
     @property
     def time_ns(self) -> int:
         """Time of the newest step [ns]."""
-        return self._bench.clock.time_ns
+        return self._bench.time_ns
 
     @property
     def pose(self) -> Pose:
         """Of the tool, as the encoders say."""
-        return self._bench.clock.motion.reported
+        return self._bench.motion.reported
 
     def command(self, stamp_ns: int, twist: Sequence[float]) -> None:
         """Take a twist (6,) of the tool in the base [m/s, rad/s]."""
@@ -64,10 +64,10 @@ class TwistController:
         """Go on by one step."""
         late = self.time_ns - self._commanded_ns > TIMEOUT_NS
         twist = np.zeros(6) if late or not self.active else self._twist
-        clock = self._bench.clock
-        clock.motion.speed(twist, ACCELERATION_M_S2)
-        clock.wait_until(clock.time_ns + self._period_ns)
-        self.wrenches = self._bench.cell.read()
+        bench = self._bench
+        bench.motion.speed(twist, ACCELERATION_M_S2)
+        bench.wait_until(bench.time_ns + self._period_ns)
+        self.wrenches = bench.cell.read()
 
     def _record(self) -> None:
         plant = self._bench.plant

@@ -44,7 +44,7 @@ class Rig:
     def __init__(self, clock=None, told_s=0.0):
         made = contact()
         self.bench, self.goal, self._arm = made.bench, made.goal, made.bench.arm
-        self.clock = clock or self.bench.clock
+        self.clock = clock or self.bench
         self.stops = self.states = self.unheard = 0
         self.on_the_way = lambda: None
         self.closed, self.failed = False, threading.Event()
@@ -74,7 +74,7 @@ class Rig:
 
     @property
     def speed_m_s(self):
-        return np.linalg.norm(self.bench.clock.motion.twist[:3])
+        return np.linalg.norm(self.bench.motion.twist[:3])
 
     # NodeArm
 

@@ -17,8 +17,8 @@ from tactile_resonance.simulation.plant.tabletop import TIP_IN_FLANGE
     [
         ({"command": "explode"}, "command: expected one of state"),
         ({"command": "freeze"}, "seconds: got None"),
-        ({"command": "freeze", "seconds": 1, "part": "cable"}, "part: 'cable'"),
-        ({"command": "script_starts", "value": 1}, "value: 1"),
+        ({"command": "freeze", "seconds": 1, "part": "cable"}, "part: got 'cable'"),
+        ({"command": "script_starts", "value": 1}, "value: got 1"),
         ({"command": "place_surface", "height_m": 7}, "surface_height_m"),
         ({"command": "place_tissue", "name": "granite"}, "tissue: .*'granite'"),
         ({"command": "move_surface", "breath_m": 0.5}, "breath_m: got 0.5; accepted is 0 to 0.02"),
