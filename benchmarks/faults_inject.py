@@ -9,6 +9,7 @@ publishes a time that jumps; ``node COMMAND...`` runs a node that hears the rela
 from __future__ import annotations
 
 import os
+import re
 import sys
 import threading
 import time
@@ -72,7 +73,7 @@ def relayed_topic(hop: Hop) -> str:
 
 def _run_node(command: Sequence[str]) -> None:
     """Become the node of this command, with the topics of its hops from the relay."""
-    node = command[command.index("-m") + 1].rpartition(".")[2]
+    (node,) = re.findall(r"tactile_resonance\.nodes\.(\w+)", " ".join(command))
     remapped = [f"{hop.topic}:={relayed_topic(hop)}" for hop in HOPS if hop.listener == node]
     more = [word for each in remapped for word in ("-r", each)]
     os.execv(command[0], [*command, *more])
