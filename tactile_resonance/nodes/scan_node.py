@@ -7,6 +7,7 @@ import math
 import os
 import socket
 import time
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -214,7 +215,8 @@ class ScanNode(ManagedNode):
                     result.message += f". NOT WRITTEN: {error}"
         finally:
             if file is not None:
-                file.close()
+                with suppress(OSError):  # of what could not be written: told above
+                    file.close()
                 if not result.file:
                     Path(request.file).unlink()
 
