@@ -17,10 +17,7 @@ import numpy.typing as npt
 
 from tactile_resonance._typing import ComplexArray, FloatArray
 from tactile_resonance.poles.compiled import entry
-from tactile_resonance.poles.result import (
-    natural_frequency_and_damping,
-    natural_frequency_and_damping_jacobian,
-)
+from tactile_resonance.poles.result import natural_frequency_and_damping
 from tactile_resonance.poles.structure import ModelStructure
 
 # A mode this fraction of the band outside of it is still one that the lines show.
@@ -351,13 +348,29 @@ def modes_in_band(poles_rad_s: ComplexArray, band_hz: tuple[float, float]) -> Co
         NaN from the last mode on.
     """
     margin = BAND_MARGIN * (band_hz[1] - band_hz[0])
-    poles = poles_rad_s.reshape(-1, poles_rad_s.shape[-1])
-    size_hz = np.abs(poles) / (2 * np.pi)
-    outside = ~((poles.imag > 0) & (size_hz >= band_hz[0] - margin) & (size_hz <= band_hz[1] + margin))
-    size_hz[outside] = np.inf
-    order = size_hz.argsort(axis=1, kind="stable")[:, : poles.shape[1] // 2]
-    found = np.where(outside, complex(np.nan, np.nan), poles)[np.arange(len(poles))[:, None], order]
-    return found.reshape(*poles_rad_s.shape[:-1], order.shape[1])
+    n = poles_rad_s.shape[-1]
+    poles = poles_rad_s.reshape(-1, n)
+    found = np.full((len(poles), n // 2), complex(np.nan, np.nan))
+    _in_band(poles, band_hz[0] - margin, band_hz[1] + margin, found)
+    return found.reshape(*poles_rad_s.shape[:-1], n // 2)
+
+
+@entry
+def _in_band(poles, low_hz, high_hz, found):
+    """Of poles (points, n) those above the real axis in a band, by natural frequency, into (points, n // 2)."""
+    points, n = poles.shape
+    f0_hz = np.empty(n // 2)
+    for point in range(points):
+        count = 0
+        for pole in poles[point]:
+            size_hz = np.abs(pole) / (2 * np.pi)
+            if pole.imag > 0 and low_hz <= size_hz <= high_hz and count < n // 2:
+                k = count
+                while k > 0 and f0_hz[k - 1] > size_hz:
+                    f0_hz[k], found[point, k] = f0_hz[k - 1], found[point, k - 1]
+                    k -= 1
+                f0_hz[k], found[point, k] = size_hz, pole
+                count += 1
 
 
 def propagated(
@@ -367,9 +380,39 @@ def propagated(
 
     From derivatives of the poles (points, k, p) by the first p coefficients, of covariance (points, n, n).
     """
-    of_poles = real_covariance(sensitivity, parameters)
-    turn = natural_frequency_and_damping_jacobian(poles)
-    return of_poles, turn @ of_poles @ turn.swapaxes(-1, -2)
+    of_poles, in_f0 = np.empty((2, *poles.shape, 2, 2))
+    _propagate(poles, sensitivity, parameters, of_poles, in_f0)
+    return of_poles, in_f0
+
+
+@entry
+def _propagate(poles, sensitivity, parameters, of_poles, in_f0):
+    """Put what `propagated` gives into the last two."""
+    points, count, p = sensitivity.shape
+    for point in range(points):
+        for k in range(count):
+            rr = ri = ii = 0.0
+            for i in range(p):
+                to_re = to_im = 0.0
+                for j in range(p):
+                    value = sensitivity[point, k, j]
+                    to_re += parameters[point, i, j] * value.real
+                    to_im += parameters[point, i, j] * value.imag
+                value = sensitivity[point, k, i]
+                rr += value.real * to_re
+                ri += value.real * to_im
+                ii += value.imag * to_im
+            of_poles[point, k, 0, 0], of_poles[point, k, 1, 1] = rr, ii
+            of_poles[point, k, 0, 1] = of_poles[point, k, 1, 0] = ri
+            # rows of `natural_frequency_and_damping_jacobian`
+            re, im = poles[point, k].real, poles[point, k].imag
+            size = np.sqrt(re * re + im * im)
+            a, b = re / (2 * np.pi * size), im / (2 * np.pi * size)
+            c, d = -im * im / size**3, re * im / size**3
+            in_f0[point, k, 0, 0] = a * a * rr + 2 * a * b * ri + b * b * ii
+            in_f0[point, k, 1, 1] = c * c * rr + 2 * c * d * ri + d * d * ii
+            both = a * c * rr + (a * d + b * c) * ri + b * d * ii
+            in_f0[point, k, 0, 1] = in_f0[point, k, 1, 0] = both
 
 
 def pole_quantities(
