@@ -692,11 +692,15 @@ def _are_flat(power, whole, bins, rules, sums):
     for k in range(rules.pieces * size, bins):
         sums[last] += power[k]
     sums[last] *= size / (bins - last * size)
-    total = logarithm = 0.0
+    total, logarithm, product = 0.0, 0.0, 1.0
     for piece in range(rules.pieces):
         value = sums[piece] * (bins / (whole * size))
         total += value
-        logarithm += np.log(value)
+        product *= value
+        if not 1e-100 < product < 1e100:  # a logarithm costs as much as all else
+            logarithm += np.log(product)
+            product = 1.0
+    logarithm += np.log(product)
     return np.log(total / rules.pieces) - logarithm / rules.pieces <= rules.flat
 
 

@@ -267,13 +267,16 @@ def _modelled(variance, gain, flat, sloped, model, kind, used):
 @inner
 def _spread(sample, model, usable, used):
     """``log mean - mean log`` of samples over their model."""
-    total = logarithm = 0.0
+    total, logarithm, product = 0.0, 0.0, 1.0
     for k in range(sample.size):
         if usable[k] > 0:
             ratio = sample[k] / model[k]
             total += ratio
-            logarithm += np.log(ratio)
-    return np.log(total / used) - logarithm / used
+            product *= ratio
+            if not 1e-100 < product < 1e100:  # a logarithm costs as much as all else
+                logarithm += np.log(product)
+                product = 1.0
+    return np.log(total / used) - (logarithm + np.log(product)) / used
 
 
 @inner
