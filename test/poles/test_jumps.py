@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from poles.mode_at_250_hz import HARMONICS, RATE_HZ, SAMPLES
 from poles.test_drift import record as drifting_record
+from poles.test_drift import repeated
 from scipy import stats
 
-from tactile_resonance.poles.estimator import identify_poles_from_records
 from tactile_resonance.poles.result import PolesStatus
 from tactile_resonance.poles.structure import ModelStructure
 
@@ -43,16 +43,9 @@ def of_parts(periods, parts, rng, rest):
     return u.reshape(periods, SAMPLES), y.reshape(periods, SAMPLES)
 
 
-def poles_of(u, y, snr_db, rng, structure=DEFAULT):
+def poles_of(u, y, snr_db, rng):
     noise = np.std(y) * 10 ** (-snr_db / 20)
-    return identify_poles_from_records(
-        u + noise / 10 * rng.standard_normal(u.shape),
-        y + noise * rng.standard_normal(y.shape),
-        sample_rate_hz=RATE_HZ,
-        harmonics=HARMONICS,
-        band_hz=(200.0, 300.0),
-        structure=structure,
-    )
+    return next(repeated((u, y), noise, DEFAULT, runs=1, first=rng))
 
 
 def a_jump(seed):
